@@ -1,0 +1,103 @@
+"""The narrow band: compact unknowns near the surface, one sheet per bank."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from beltrami_cli.errors import DataError
+from beltrami_cli.grid import Grid
+from beltrami_cli.kernels import interpolate, sheets
+from beltrami_cli.levelset import ZeroSurface, crossing_box, zero_surface
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Entries (voxel, sheet): one per voxel where the surface is alone, one per bank in a thin sulcus or gyral blade.
+
+    grid: the whole volume's grid; box: the part of it that the band lies in.
+    surface: the mesh in mm along the voxel axes, from the first voxel of the box; None for a flat band.
+    voxel: (E,) int32, flat index in the box; entries are in its order, nearest sheet first.
+    first: (X + 1,) int32, entries of the box's voxel x are first[x] .. first[x + 1] - 1; the first one is primary.
+    vertex: (E,) int32, the surface's vertex that the entry belongs to.
+    normal: (3, E) float32, unit, along the voxel axes, at the closest point. distance: (E,) float32, signed, mm.
+    forward, backward: (3, E) int32, linked entries one voxel on along each axis; the entry itself where there is none.
+    """
+
+    grid: Grid
+    box: tuple[slice, ...]
+    half_width: float
+    surface: ZeroSurface | None
+    voxel: np.ndarray
+    first: np.ndarray
+    vertex: np.ndarray
+    normal: np.ndarray
+    distance: np.ndarray
+    forward: np.ndarray
+    backward: np.ndarray
+
+    @property
+    def entries(self) -> int:
+        return len(self.voxel)
+
+    @property
+    def box_shape(self) -> tuple[int, ...]:
+        return tuple(s.stop - s.start for s in self.box)
+
+    @cached_property
+    def primary(self) -> np.ndarray:
+        """(B,) int64: the entry of each band voxel's nearest sheet; what a volume shows."""
+        starts = self.first[:-1]
+        return starts[starts < self.first[1:]].astype(np.int64)
+
+    @property
+    def nodes(self) -> tuple[int, int, int]:
+        """Stencil nodes along each axis: 4 for the cubic, 1 along the missing axis of a plane."""
+        a, b, c = (4 if n > 1 else 1 for n in self.grid.shape)
+        return a, b, c
+
+    def gather(self, volume: np.ndarray) -> np.ndarray:
+        """Values (E,) of a volume on the whole grid at every entry's voxel, shared by its sheets."""
+        return np.ascontiguousarray(volume[self.box]).reshape(-1)[self.voxel]
+
+    def scatter(self, values: np.ndarray, outside: np.ndarray | float) -> np.ndarray:
+        """A volume on the whole grid: primary entries' values (E,) in the band, `outside` elsewhere."""
+        out = np.empty(self.grid.shape, values.dtype)
+        out[...] = outside
+        box = np.ascontiguousarray(out[self.box])
+        box.reshape(-1)[self.voxel[self.primary]] = values[self.primary]
+        out[self.box] = box
+        return out
+
+    @cached_property
+    def closest_offset(self) -> np.ndarray:
+        """(3, E) float32: from each entry's voxel to its closest surface point, in voxels."""
+        spacing = self.grid.spacing.astype(np.float32)
+        return -self.distance * self.normal / spacing[:, None]
+
+
+def build_band(psi: np.ndarray, grid: Grid, half_width: float) -> Band:
+    """The band of `half_width` mm around the zero level of psi (nx, ny, nz), any function with that zero set.
+
+    Raises DataError where psi has no zero level.
+    """
+    spacing = grid.spacing
+    margin = tuple(int(np.ceil(half_width / h)) + 1 if n > 1 else 0 for h, n in zip(spacing, grid.shape, strict=True))
+    box = crossing_box(psi, margin)
+    surface = zero_surface(psi[box], spacing)
+    shape = tuple(s.stop - s.start for s in box)
+    s = surface
+    grown = sheets.grow(shape, spacing, s.points, s.normals, s.start, s.ring, half_width)
+    voxel, vertex, first = sheets.arrange(*grown)
+    normal, distance = sheets.closest_points(
+        voxel, vertex, shape, spacing, s.points, s.normals, s.curvature, s.direction
+    )
+    forward, backward = np.empty((3, len(voxel)), np.int32), np.empty((3, len(voxel)), np.int32)
+    for axis in range(3):
+        up, down = (
+            sheets.best_matches(voxel, vertex, first, normal, shape, spacing, s.points, axis, move) for move in (1, -1)
+        )
+        forward[axis], backward[axis] = sheets.mutual_links(up, down)
+    return Band(grid, box, half_width, surface, voxel, first, vertex, normal, distance, forward, backward)

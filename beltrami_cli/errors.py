@@ -1,0 +1,21 @@
+"""Exceptions whose message is the one line a user reads, each with the exit code that tells causes apart."""
+
+
+class BeltramiError(Exception):
+    """Base of every error that is reported as a single line; never raised itself."""
+
+    exit_code = 1
+
+
+class DataError(BeltramiError):
+    """The content of an input cannot be used: unreadable, truncated, no zero level, nothing but NaN."""
+
+
+class NumericsError(BeltramiError):
+    """A computation left the finite numbers."""
+
+
+class RefusedError(BeltramiError):
+    """Refused before starting: usage, configuration, an output that exists, grids that differ, dt over its bound."""
+
+    exit_code = 2

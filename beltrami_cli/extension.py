@@ -1,0 +1,140 @@
+"""Extension of data off the surface: every entry of the band gets a value, constant along normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beltrami_cli.band import Band
+from beltrami_cli.errors import DataError
+from beltrami_cli.kernels import extend as kernels
+from beltrami_cli.kernels import interpolate, steps
+
+EXTENSIONS = ("closest-point", "pde", "none")
+
+# Trilinear weight that valid corners must hold for a value to count as known: one corner's mean share.
+LEAST_WEIGHT = 0.125
+# Filling is a start for the flow, not an answer: residual at which it stops, and the most iterations it gets.
+FILL_TOLERANCE = 1e-3
+FILL_ITERATIONS = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Extended:
+    """Start values on the band.
+
+    values: (E,), NaN only on a bank without any valid data. known: (E,) bool, False where a hole was filled.
+    """
+
+    values: np.ndarray
+    known: np.ndarray
+
+
+def extend(band: Band, samples: np.ndarray, method: str = "closest-point") -> Extended:
+    """Carry data off the surface on every sheet.
+
+    samples: (E,), a volume's values at the entries (`Band.gather`), NaN where missing. Only primary entries feed a bank.
+    method: "closest-point" (each entry takes the trilinear value of valid voxels at its closest surface point), "pde"
+    (U_t + sign(Psi) grad U . grad Psi = 0, Sec. 2.1) or "none" (each voxel keeps its own value; sheets other than the
+    nearest take the closest point's). Holes are then filled from the band around them.
+    Raises DataError where no entry is reached by valid data.
+    """
+    own = np.full_like(samples, np.nan)
+    own[band.primary] = samples[band.primary]
+    if band.surface is None:
+        values = own
+    elif method == "pde":
+        values = transported(band, own)
+    else:
+        values = own.copy() if method == "none" else np.full_like(own, np.nan)
+        secondary = np.ones(band.entries, bool)
+        secondary[band.primary] = method != "none"
+        nearest = at_closest_points(band, own)
+        values[secondary] = nearest[secondary]
+    known = ~np.isnan(values)
+    if not known.any():
+        raise DataError(
+            "the data have no valid value on the surface: found only NaN beside the zero level, expected finite values "
+            "there (do LEVELSET and DATA belong together?)"
+        )
+    if not known.all():
+        fill(band, values, known)
+    return Extended(values, known)
+
+
+def at_closest_points(band: Band, own: np.ndarray) -> np.ndarray:
+    """(E,) trilinear values of `own` (E,) at each entry's closest point; NaN where valid corners are too few."""
+    out = np.full_like(own, np.nan)
+    start = np.arange(band.entries, dtype=np.int32)
+    interpolate.linear(own, start, band.closest_offset, band.forward, band.backward, LEAST_WEIGHT, out)
+    return out
+
+
+def transported(band: Band, own: np.ndarray) -> np.ndarray:
+    """(E,) solution of the initial value problem of Sec. 2.1, run for twice the time that the front takes to the rim."""
+    spacing = band.grid.spacing
+    used = spacing[np.array(band.grid.shape) > 1]
+    dt = 0.9 / np.sqrt((1 / used**2).sum())  # mm at unit speed: the upwind scheme's own bound, with a margin
+    u, out = own.copy(), np.empty_like(own)
+    for _ in range(int(np.ceil(2 * band.half_width / dt))):
+        kernels.transport(
+            u, band.normal, band.distance, band.forward, band.backward, spacing, float(used.min()), dt, out
+        )
+        u, out = out, u
+    return u
+
+
+def fill(band: Band, values: np.ndarray, known: np.ndarray) -> None:
+    """Fill unknown entries in place with the harmonic function in the band that meets the known ones at the hole's rim.
+
+    Conjugate gradients on the Laplacian over the band's links, started from a ring-by-ring flood; no value leaves the
+    range of the known ones. Banks without any known value stay NaN.
+    """
+    kernels.flood(values, band.forward, band.backward)
+    free = ~known & ~np.isnan(values)
+    u = np.where(np.isnan(values), 0, values).astype(np.float64)
+    minus_laplacian = _laplacian(band)
+    residual = np.where(free, -minus_laplacian(u), 0.0)
+    direction, size = residual.copy(), float(residual @ residual)
+    target = FILL_TOLERANCE**2 * max(size, 1e-300)
+    for _ in range(FILL_ITERATIONS):
+        if size <= target:
+            break
+        image = np.where(free, minus_laplacian(direction), 0.0)
+        stride = size / float(direction @ image)
+        u += stride * direction
+        residual -= stride * image
+        size, before = float(residual @ residual), size
+        direction = residual + size / before * direction
+    low, high = values[known].min(), values[known].max()
+    values[free] = np.clip(u[free], low, high)
+
+
+def _laplacian(band: Band):  # type: ignore[no-untyped-def]
+    """u (E,) float64 -> -Laplacian over links: the symmetric scheme with P = I and c = 1."""
+    flat = np.zeros((3, band.entries))
+    work, out = np.empty((7, band.entries)), np.empty(band.entries)
+    spacing = band.grid.spacing
+
+    def apply(u: np.ndarray) -> np.ndarray:
+        steps.symmetric(u, flat, band.forward, band.backward, spacing, steps.ONE, False, 0.0, 1.0, work, out)
+        return u - out
+
+    return apply
+
+
+class Reextension:
+    """Makes values constant along normals again: the local cubic at each entry's closest point, on its own sheet."""
+
+    def __init__(self, band: Band) -> None:
+        self.band = band
+        start = np.arange(band.entries, dtype=np.int32)
+        self.origin = interpolate.stencil_origins(
+            start, band.closest_offset, band.forward, band.backward, band.nodes
+        )
+
+    def __call__(self, u: np.ndarray, out: np.ndarray) -> None:
+        """Write the re-extended u into out, both (E,); an entry whose stencil is incomplete keeps its value."""
+        out[:] = u
+        interpolate.cubic(u, self.origin, self.band.closest_offset, self.band.forward, self.band.nodes, out)

@@ -1,0 +1,216 @@
+"""The one door to files: volumes in, volumes and meshes out, each format by its suffix.
+
+The only place that knows RAS from LPS, units from millimetres and one header from another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from beltrami_cli.errors import RefusedError
+from beltrami_cli.formats import checks, gifti, metaimage, mgh, nifti, npy, plain_mesh, png
+from beltrami_cli.formats.staging import Stage
+from beltrami_cli.grid import Grid, Volume
+from beltrami_cli.surface import Mesh
+
+__all__ = [
+    "Stage",
+    "mesh_beside",
+    "mesh_files",
+    "mesh_format",
+    "read_grid",
+    "read_volume",
+    "require_writable",
+    "stem",
+    "volume_files",
+    "volume_format",
+    "write_mesh",
+    "write_volume",
+]
+
+_VOLUMES = {
+    ".nii": "NIfTI",
+    ".nii.gz": "NIfTI",
+    ".hdr": "NIfTI",
+    ".img": "NIfTI",
+    ".mha": "MetaImage",
+    ".mhd": "MetaImage",
+    ".npy": "NPY",
+    ".mgz": "MGH",
+    ".mgh": "MGH",
+    ".png": "PNG",
+}
+_MESHES = {".surf.gii": "GIFTI", ".ply": "PLY", ".obj": "OBJ", ".stl": "STL", ".glb": "GLB", ".vtk": "VTK"}
+
+
+def volume_format(path: Path) -> str:
+    """NIfTI, MetaImage, NPY, MGH or PNG, by suffix; raises RefusedError, with the known ones, for another suffix."""
+    return _by_suffix(Path(path), _VOLUMES, "volume")
+
+
+def mesh_format(path: Path) -> str:
+    """GIFTI, PLY, OBJ, STL, GLB or VTK, by suffix; raises RefusedError, with the known ones, for another suffix."""
+    return _by_suffix(Path(path), _MESHES, "mesh")
+
+
+def stem(path: Path) -> Path:
+    """The path without its format suffix: o.nii.gz -> o, o.func.gii -> o.func, o.surf.gii -> o.surf."""
+    path = Path(path)
+    suffix = ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix
+    return path.with_name(path.name[: len(path.name) - len(suffix)])
+
+
+def read_grid(path: Path, *, spacing: float | Sequence[float] | None = None) -> Grid:
+    """The grid of a volume from its header alone; arguments and errors as `read_volume`."""
+    path = Path(path)
+    kind = _require_readable(path, spacing)
+    match kind:
+        case "NIfTI":
+            return nifti.read_grid(path)
+        case "MetaImage":
+            return metaimage.read_grid(path)
+        case "MGH":
+            return mgh.read_grid(path)
+        case "PNG":
+            return png.read_grid(path)
+        case _:
+            return npy.read_grid(path, _steps(spacing))
+
+
+def read_volume(path: Path, *, spacing: float | Sequence[float] | None = None, dtype: DTypeLike = np.float32) -> Volume:
+    """Read a volume as `dtype` (float32 or float64), indexed (i, j, k) alike whatever the format, on a RAS mm grid.
+
+    Trailing axes of length 1 are dropped and a plane gets one slice; `Volume.file_shape` keeps the shape as stored.
+    NaN and infinite values stay as they are. The array has the file's memory order.
+
+    spacing: mm per voxel, one number or one per axis, for NPY, which holds none (default 1).
+
+    Raises RefusedError for an unknown suffix, a missing file, several frames, complex or coloured pixels, or
+    `spacing` where the format has its own; DataError where the content cannot be read.
+    """
+    path = Path(path)
+    kind = _require_readable(path, spacing)
+    match kind:
+        case "NIfTI":
+            return nifti.read(path, dtype)
+        case "MetaImage":
+            return metaimage.read(path, dtype)
+        case "MGH":
+            return mgh.read(path, dtype)
+        case "PNG":
+            return png.read(path, dtype)
+        case _:
+            return npy.read(path, _steps(spacing), dtype)
+
+
+def volume_files(path: Path) -> list[Path]:
+    """Every file that `write_volume` makes for this path; raises RefusedError where the format is not written."""
+    path = Path(path)
+    match volume_format(path):
+        case "NIfTI":
+            return nifti.files(path)
+        case "MetaImage":
+            return metaimage.files(path)
+        case "PNG":
+            raise RefusedError(f"{path}: PNG pictures are read only, they hold no real numbers; write .npy or .nii.gz")
+        case _:
+            return [path]
+
+
+def require_writable(path: Path, grid: Grid) -> None:
+    """Raise RefusedError where a volume on this grid cannot be written to this path: before anything is computed."""
+    path = Path(path)
+    volume_files(path)
+    if volume_format(path) == "MetaImage":
+        metaimage.require_writable(path, grid)
+
+
+def write_volume(path: Path, volume: Volume, *, dtype: DTypeLike = np.float32) -> None:
+    """Write `volume.data` as `dtype` (float32 or float64; MGH always float32) in the shape `volume.file_shape`.
+
+    The header is that of the file which the volume came from where the format is the same, else a fresh one. Makes
+    `volume_files(path)`, replacing what is there. Raises RefusedError as `require_writable`, DataError where the
+    file cannot be written.
+    """
+    path = Path(path)
+    volume_files(path)
+    match volume_format(path):
+        case "NIfTI":
+            nifti.write(path, volume, dtype)
+        case "MetaImage":
+            metaimage.write(path, volume, dtype)
+        case "MGH":
+            mgh.write(path, volume)
+        case _:
+            npy.write(path, volume, dtype)
+
+
+def mesh_beside(path: Path, *, curve: bool = False) -> Path:
+    """The mesh that goes with a volume where none is named: .surf.gii for NIfTI and MGH, .ply else and for a curve."""
+    neuroimaging = volume_format(path) in ("NIfTI", "MGH")
+    return stem(path).with_name(stem(path).name + (".surf.gii" if neuroimaging and not curve else ".ply"))
+
+
+def mesh_files(path: Path, *, values: bool = True, curve: bool = False) -> list[Path]:
+    """Every file that `write_mesh` makes for this path: .surf.gii has its values in .func.gii beside it.
+
+    Raises RefusedError for an unknown suffix, and for a curve in a format that holds no lines (GIFTI, STL, GLB).
+    """
+    path = Path(path)
+    kind = mesh_format(path)
+    if curve and kind in ("GIFTI", "STL", "GLB"):
+        raise RefusedError(f"{path}: {kind} holds triangles, not the lines of a curve; write .ply, .vtk or .obj")
+    if kind == "GIFTI" and values:
+        return [path, gifti.values_file(path)]
+    return [path]
+
+
+def write_mesh(path: Path, mesh: Mesh) -> list[Path]:
+    """Write the mesh in RAS mm, vertices and faces in the order given, and return the files made.
+
+    Values are numbers in PLY (`value`), VTK and GIFTI, and colours in PLY, OBJ and GLB; STL holds the shape alone.
+    Raises RefusedError as `mesh_files`, DataError where a file cannot be written.
+    """
+    path = Path(path)
+    curve = mesh.cells.shape[1] == 2
+    written = mesh_files(path, values=mesh.values is not None, curve=curve)
+    match mesh_format(path):
+        case "GIFTI":
+            gifti.write(path, mesh)
+        case "PLY":
+            plain_mesh.write_ply(path, mesh)
+        case "VTK":
+            plain_mesh.write_vtk(path, mesh)
+        case "OBJ" if curve:
+            plain_mesh.write_obj_lines(path, mesh)
+        case _:
+            plain_mesh.write_with_trimesh(path, mesh)
+    return written
+
+
+def _by_suffix(path: Path, known: dict[str, str], what: str) -> str:
+    for suffix, kind in known.items():
+        if path.name.lower().endswith(suffix):
+            return kind
+    raise RefusedError(f"{path}: not the suffix of a {what}; expected one of {' '.join(known)}")
+
+
+def _require_readable(path: Path, spacing: float | Sequence[float] | None) -> str:
+    kind = volume_format(path)
+    checks.require_file(path)
+    if spacing is not None and kind != "NPY":
+        raise RefusedError(f"{path}: {kind} has its own spacing; --spacing is for .npy only")
+    return kind
+
+
+def _steps(spacing: float | Sequence[float] | None) -> float | tuple[float, ...]:
+    if spacing is None:
+        return 1.0
+    steps = np.atleast_1d(np.asarray(spacing, float))
+    if len(steps) > 3 or not (np.isfinite(steps) & (steps > 0)).all():
+        raise RefusedError(f"spacing {spacing}: expected one positive number of mm, or one for each axis")
+    return float(steps[0]) if len(steps) == 1 else tuple(map(float, steps))

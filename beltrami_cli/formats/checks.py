@@ -1,0 +1,126 @@
+"""What every volume format has to refuse, and the guard that turns a library's failure into one line."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from beltrami_cli.errors import BeltramiError, DataError, RefusedError
+
+# Vertices per hemisphere of the usual cortical meshes, whose data is often stored in volume files.
+_SURFACE_SIZES = {642, 2562, 10242, 40962, 163842, 32492, 59292}
+# No imaging matrix has an axis this long; vertices folded into a volume file do (fsaverage as 27307 x 1 x 6).
+_LONGEST_AXIS = 16384
+
+
+@contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """Run a library's reader: its warnings and log lines stay silent, whatever it raises becomes a DataError."""
+    with _quietly():
+        try:
+            yield
+        except BeltramiError:
+            raise
+        except Exception as error:
+            raise DataError(
+                f"{path}: cannot be read as {kind} ({_reason(error)}); "
+                "expected a complete file of that format: check that it was copied or downloaded whole"
+            ) from error
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Run a library's writer: as `reading`, with a line that says that the file could not be written."""
+    with _quietly():
+        try:
+            yield
+        except BeltramiError:
+            raise
+        except Exception as error:
+            raise DataError(
+                f"{path.name}: cannot be written ({_reason(error)}); check the disk and its quota"
+            ) from error
+
+
+def require_file(path: Path) -> None:
+    """Raise RefusedError unless `path` is a file that can be opened."""
+    if path.is_symlink() and not path.exists():
+        raise RefusedError(
+            f"{path}: a link to a file that is not there; fetch its content first (datalad get, git annex)"
+        )
+    if not path.exists():
+        raise RefusedError(f"{path}: no such file; check the path")
+    if not path.is_file():
+        raise RefusedError(f"{path}: not a file; expected a volume, not a folder or a device")
+    try:
+        path.open("rb").close()
+    except OSError as error:
+        raise RefusedError(f"{path}: cannot be opened ({error.strerror}); check its permissions") from error
+
+
+def spatial_shape(path: Path, file_shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """The three spatial axes of an array as stored: trailing axes of length 1 dropped, a plane given one slice.
+
+    Raises RefusedError for several frames, a single line of values or an empty array.
+    """
+    found = f"{len(file_shape)}-D ({' x '.join(map(str, file_shape))})"
+    if len(file_shape) < 2:
+        raise RefusedError(f"{path}: expected a volume of 2 or 3 axes; found {found}")
+    if 0 in file_shape:
+        raise RefusedError(f"{path}: expected values; found an empty array, {found}")
+    if max(file_shape[3:], default=1) > 1:
+        axes = ", ".join(("x", "y", "z", *map(str, file_shape[3:])))
+        raise RefusedError(
+            f"{path}: several frames are not supported yet: found {len(file_shape)}-D ({axes}); extract one frame"
+        )
+    nx, ny, nz = (*file_shape, 1)[:3]
+    if sorted((nx, ny, nz))[1] == 1 or max(nx, ny, nz) > _LONGEST_AXIS:
+        size = nx * ny * nz
+        guess = f", {size} values as on a cortical mesh" if size in _SURFACE_SIZES else ""
+        raise RefusedError(
+            f"{path}: expected a volume or a plane; found {found}{guess}: data of a surface or a time course, "
+            "not of voxels; give the volume instead"
+        )
+    return nx, ny, nz
+
+
+def require_real(path: Path, dtype: np.dtype) -> None:
+    """Raise RefusedError unless pixels of this type are single real numbers."""
+    if dtype.kind == "c":
+        raise RefusedError(f"{path}: expected real values; found complex ones ({dtype}); extract magnitude or phase")
+    if dtype.kind not in "fiub":
+        what = "vector or RGB pixels" if dtype.names else f"values of type {dtype}"
+        raise RefusedError(f"{path}: expected one number per voxel; found {what}; extract one channel")
+
+
+def require_usable_affine(path: Path, affine: np.ndarray) -> None:
+    """Raise DataError unless `affine` maps voxels to distinct, finite points."""
+    if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-12 * np.abs(affine[:3, :3]).max() ** 3:
+        rows = "; ".join(" ".join(f"{v:.4g}" for v in row) for row in affine[:3])
+        raise DataError(f"{path}: its header places the voxels nowhere: affine [{rows}]; repair the header")
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    log = logging.getLogger("nibabel.global")
+    was_disabled, log.disabled = log.disabled, True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.disabled = was_disabled
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if "ITK ERROR" in str(error):
+        return "its content is damaged, cut short or of another kind"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__

@@ -1,0 +1,32 @@
+"""Colours of values on a mesh, for viewers that know no scalars."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Viridis at 16 equal steps, RGB 0..255: perceptually uniform, and readable without colour vision.
+_VIRIDIS = np.array(
+    [
+        (68, 1, 84), (72, 26, 108), (71, 47, 125), (65, 68, 135), (57, 86, 140), (49, 104, 142),
+        (42, 120, 142), (35, 136, 142), (31, 152, 139), (34, 168, 132), (53, 183, 121), (84, 197, 104),
+        (122, 209, 81), (165, 219, 54), (210, 226, 27), (253, 231, 37),
+    ]
+)  # fmt: skip
+_MISSING = 128  # mid grey: no colour of the map
+
+# A few outliers must not take the whole scale.
+_PERCENTILES = (2.0, 98.0)
+
+
+def rgb(values: np.ndarray) -> np.ndarray:
+    """(V, 3) uint8 colours of (V,) values over their 2nd to 98th percentile; grey where they are not finite."""
+    colours = np.full((len(values), 3), _MISSING, np.uint8)
+    finite = np.isfinite(values)
+    if not finite.any():
+        return colours
+    low, high = np.percentile(values[finite], _PERCENTILES)
+    position = (values[finite] - low) / (high - low) if high > low else np.full(finite.sum(), 0.5)
+    steps = np.linspace(0.0, 1.0, len(_VIRIDIS))
+    for channel in range(3):
+        colours[finite, channel] = np.rint(np.interp(position, steps, _VIRIDIS[:, channel]))
+    return colours

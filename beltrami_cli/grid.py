@@ -1,0 +1,115 @@
+"""A grid in world space (`Grid`) and values on it (`Volume`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from beltrami_cli.errors import RefusedError
+
+# Two grids are one when no corner is displaced by more than this share of the smallest voxel edge:
+# well under what a difference could resolve, well above float32 rounding in stored headers.
+CORNER_TOLERANCE = 1e-3
+
+# Axes count as orthogonal up to this cosine between them (0.06 degrees: rounding in stored quaternions).
+SHEAR_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A regular voxel grid.
+
+    shape: voxels along the three array axes (a plane has one axis of length 1).
+    affine: (4, 4) float64, from voxel indices (i, j, k, 1) at voxel centres to RAS millimetres.
+    """
+
+    shape: tuple[int, int, int]
+    affine: np.ndarray
+
+    @staticmethod
+    def from_spacing(shape: tuple[int, ...], spacing: float | tuple[float, ...] = 1.0) -> Grid:
+        """Axis-aligned grid with its first voxel at the origin.
+
+        shape: one to three axes; the missing ones get length 1.
+        spacing: mm, one for all axes or one for each of the first (1 mm for the rest).
+        """
+        nx, ny, nz = (*map(int, shape), 1, 1)[:3]
+        edges = np.ones(3)
+        edges[: len(spacing) if isinstance(spacing, tuple) else 3] = spacing
+        return Grid((nx, ny, nz), np.diag([*edges, 1.0]))
+
+    @property
+    def spacing(self) -> np.ndarray:
+        """(3,) voxel edge lengths in mm."""
+        return np.sqrt((self.affine[:3, :3] ** 2).sum(0))
+
+    @property
+    def handedness(self) -> int:
+        """+1 where the index axes form a right-handed frame in RAS, -1 where left-handed."""
+        return 1 if np.linalg.det(self.affine[:3, :3]) > 0 else -1
+
+    def is_sheared(self) -> bool:
+        """True where the voxel axes are not orthogonal: differences along them would then not be a gradient."""
+        axes = self.affine[:3, :3] / self.spacing
+        return bool(np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR_TOLERANCE)
+
+    def to_world(self, ijk: np.ndarray) -> np.ndarray:
+        """Points (N, 3) in voxel indices to RAS mm."""
+        return ijk @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+    def to_index(self, ras_mm: np.ndarray) -> np.ndarray:
+        """Points (N, 3) in RAS mm to voxel indices."""
+        return np.linalg.solve(self.affine[:3, :3], (ras_mm - self.affine[:3, 3]).T).T
+
+    def matches(self, other: Grid) -> bool:
+        """Same shape, and every corner at the same place within `CORNER_TOLERANCE`."""
+        if self.shape != other.shape:
+            return False
+        last = np.array(self.shape) - 1
+        corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * last
+        shift = np.abs(self.to_world(corners) - other.to_world(corners)).max()
+        return bool(shift <= CORNER_TOLERANCE * self.spacing.min())
+
+    def describe(self) -> str:
+        """One line: shape, spacing, orientation matrix and origin, for messages."""
+        steps = " x ".join(f"{s:.4g}" for s in self.spacing)
+        rows = "; ".join(" ".join(f"{v:.5g}" for v in row) for row in self.affine[:3])
+        return f"{' x '.join(map(str, self.shape))} voxels of {steps} mm, affine [{rows}]"
+
+
+def require_same_grid(first: Grid, first_name: str, second: Grid, second_name: str) -> None:
+    """Raise RefusedError, with both grids printed below the message, unless the two grids match."""
+    if not first.matches(second):
+        raise RefusedError(
+            f"grids differ: {second_name} does not lie on the grid of {first_name}; "
+            "expected one grid for both (--resample brings DATA onto the level set's grid)\n"
+            f"  {first_name}: {first.describe()}\n  {second_name}: {second.describe()}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Values on a grid.
+
+    data: array of shape `grid.shape`, floating; NaN where there is no value.
+    file_shape: the array shape in the file it came from, or should have in a file: planes and trailing axes of length 1
+        kept.
+    header: what its file format needs to write a volume like this one; opaque outside `formats`.
+    """
+
+    data: np.ndarray
+    grid: Grid
+    file_shape: tuple[int, ...] = ()
+    header: Any = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.data.shape != self.grid.shape:
+            raise ValueError(f"data has shape {self.data.shape}, its grid {self.grid.shape}")
+        if not self.file_shape:
+            object.__setattr__(self, "file_shape", self.data.shape)
+
+    def with_data(self, data: np.ndarray) -> Volume:
+        """The same grid and header around other values of the same shape."""
+        return Volume(data, self.grid, self.file_shape, self.header)

@@ -1,0 +1,144 @@
+"""Interpolation on one sheet: every stencil is reached by walking along links, so no value of another bank enters.
+
+A query is a start entry and an offset from its voxel, in voxels; a stencil spans 4 nodes along an axis that has links
+(the local cubic) and 1 along the missing axis of a plane.
+"""
+
+import numba as nb
+import numpy as np
+
+
+@nb.njit(cache=True)
+def walk(e, s0, s1, s2, forward, backward):
+    """The entry s0, s1, s2 voxels away along links, axis by axis in whatever order they allow; -1 where they end."""
+    while s0 != 0 or s1 != 0 or s2 != 0:
+        before = e
+        if s0 != 0:
+            o = forward[0, e] if s0 > 0 else backward[0, e]
+            if o != e:
+                e = o
+                s0 += -1 if s0 > 0 else 1
+        if s1 != 0:
+            o = forward[1, e] if s1 > 0 else backward[1, e]
+            if o != e:
+                e = o
+                s1 += -1 if s1 > 0 else 1
+        if s2 != 0:
+            o = forward[2, e] if s2 > 0 else backward[2, e]
+            if o != e:
+                e = o
+                s2 += -1 if s2 > 0 else 1
+        if e == before:
+            return -1
+    return e
+
+
+@nb.njit(cache=True)
+def stencil_origin(corner, forward, backward, nodes):
+    """The lowest entry of the stencil around a cell's low corner, or -1 unless links reach all its nodes."""
+    x = corner
+    for a in range(3):
+        if nodes[a] == 4:
+            if backward[a, x] == x:
+                return -1
+            x = backward[a, x]
+    origin = x
+    for a in range(nodes[0]):
+        if a > 0:
+            if forward[0, x] == x:
+                return -1
+            x = forward[0, x]
+        y = x
+        for b in range(nodes[1]):
+            if b > 0:
+                if forward[1, y] == y:
+                    return -1
+                y = forward[1, y]
+            z = y
+            for _ in range(1, nodes[2]):
+                if forward[2, z] == z:
+                    return -1
+                z = forward[2, z]
+    return origin
+
+
+@nb.njit(cache=True, parallel=True)
+def stencil_origins(start, offset, forward, backward, nodes):
+    """For each query (start (Q,), offset (3, Q) in voxels) the origin (Q,) of its whole stencil, -1 where incomplete."""
+    out = np.empty(len(start), np.int32)
+    for m in nb.prange(len(start)):
+        s0, s1, s2 = int(np.floor(offset[0, m])), int(np.floor(offset[1, m])), int(np.floor(offset[2, m]))
+        corner = walk(start[m], s0, s1, s2, forward, backward)
+        out[m] = -1 if corner < 0 else stencil_origin(corner, forward, backward, nodes)
+    return out
+
+
+@nb.njit(cache=True, inline="always")
+def cubic_weights(t, nodes, w):
+    """Lagrange weights at t in [0, 1] of the nodes -1, 0, 1, 2 (of the one node where an axis has one)."""
+    if nodes == 1:
+        w[0] = 1
+        return
+    w[0] = -t * (t - 1) * (t - 2) / 6
+    w[1] = (t + 1) * (t - 1) * (t - 2) / 2
+    w[2] = -(t + 1) * t * (t - 2) / 2
+    w[3] = (t + 1) * t * (t - 1) / 6
+
+
+@nb.njit(cache=True, parallel=True, fastmath=True)
+def cubic(u, origin, offset, forward, nodes, out):
+    """Local cubic of u at each query, within the range of the cell's own nodes, into out (Q,).
+
+    `origin` and `offset` as for `stencil_origins`; where the stencil is incomplete (-1), out is left as it is.
+    """
+    f0, f1, f2 = forward[0], forward[1], forward[2]
+    queries = len(origin)
+    block = 4096
+    for chunk in nb.prange((queries + block - 1) // block):
+        w0, w1, w2 = np.empty(4, u.dtype), np.empty(4, u.dtype), np.empty(4, u.dtype)
+        for m in range(chunk * block, min(queries, (chunk + 1) * block)):
+            x = origin[m]
+            if x < 0:
+                continue
+            cubic_weights(offset[0, m] - np.floor(offset[0, m]), nodes[0], w0)
+            cubic_weights(offset[1, m] - np.floor(offset[1, m]), nodes[1], w1)
+            cubic_weights(offset[2, m] - np.floor(offset[2, m]), nodes[2], w2)
+            total, low, high = u[x] * 0, u.dtype.type(np.inf), u.dtype.type(-np.inf)
+            for a in range(nodes[0]):
+                y = x
+                for b in range(nodes[1]):
+                    z = y
+                    row = u[x] * 0
+                    inner = (nodes[0] == 1 or a == 1 or a == 2) and (nodes[1] == 1 or b == 1 or b == 2)
+                    for c in range(nodes[2]):
+                        row += w2[c] * u[z]
+                        if inner and (nodes[2] == 1 or c == 1 or c == 2):
+                            low, high = min(low, u[z]), max(high, u[z])
+                        z = f2[z]
+                    total += w0[a] * w1[b] * row
+                    y = f1[y]
+                x = f0[x]
+            out[m] = min(max(total, low), high)
+
+
+@nb.njit(cache=True, parallel=True)
+def linear(u, start, offset, forward, backward, least, out):
+    """Trilinear u at each query from the cell's corners that links reach and whose value is not NaN, into out (Q,).
+
+    Weights are normalised; where they sum to less than `least`, out is left as it is.
+    """
+    for m in nb.prange(len(start)):
+        s0, s1, s2 = int(np.floor(offset[0, m])), int(np.floor(offset[1, m])), int(np.floor(offset[2, m]))
+        t0, t1, t2 = offset[0, m] - s0, offset[1, m] - s1, offset[2, m] - s2
+        total, weight = 0.0, 0.0
+        for corner in range(8):
+            a, b, c = corner >> 2, corner >> 1 & 1, corner & 1
+            w = (t0 if a else 1 - t0) * (t1 if b else 1 - t1) * (t2 if c else 1 - t2)
+            if w == 0.0:
+                continue
+            e = walk(start[m], s0 + a, s1 + b, s2 + c, forward, backward)
+            if e >= 0 and not np.isnan(u[e]):
+                total += w * u[e]
+                weight += w
+        if weight >= least:
+            out[m] = total / weight

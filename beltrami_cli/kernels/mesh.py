@@ -1,0 +1,220 @@
+"""Vertex geometry of the zero level's mesh: adjacency, crossings, normals, curvature.
+
+Positions are in millimetres along the voxel axes (index times spacing) unless called `ijk`.
+"""
+
+import numba as nb
+import numpy as np
+
+# Psi counts as smooth at a crossing when its second differences along the edge stay below this share of its slope: the
+# distance to a sphere of 4 voxels' radius reaches 0.25; a clamp, a mask or the ridge between two banks 0.5 and more.
+SMOOTH = 0.3
+
+
+@nb.njit(cache=True)
+def half_edges(cells, vertices):
+    """Neighbour lists (CSR: start, ring) of a mesh with `vertices` vertices, from triangles or segments (C, 2 or 3)."""
+    corners = cells.shape[1]
+    degree = np.zeros(vertices + 1, np.int64)
+    for c in range(len(cells)):
+        for k in range(corners):
+            degree[cells[c, k] + 1] += 2
+    start = np.cumsum(degree)
+    ring = np.empty(start[-1], np.int32)
+    filled = np.zeros(vertices, np.int64)
+    for c in range(len(cells)):
+        for k in range(corners):
+            a = cells[c, k]
+            for other in (cells[c, (k + 1) % corners], cells[c, (k + corners - 1) % corners]):
+                known = False
+                for q in range(start[a], start[a] + filled[a]):
+                    if ring[q] == other:
+                        known = True
+                        break
+                if not known:
+                    ring[start[a] + filled[a]] = other
+                    filled[a] += 1
+    packed = np.zeros(vertices + 1, np.int32)
+    for v in range(vertices):
+        packed[v + 1] = packed[v] + filled[v]
+    out = np.empty(packed[-1], np.int32)
+    for v in range(vertices):
+        for k in range(filled[v]):
+            out[packed[v] + k] = ring[start[v] + k]
+    return packed, out
+
+
+@nb.njit(cache=True)
+def face_normals(points, triangles):
+    """Unit vertex normals (V, 3): area-weighted mean of the faces around, then of the one-ring."""
+    faces = np.zeros_like(points)
+    for c in range(len(triangles)):
+        a, b, d = triangles[c, 0], triangles[c, 1], triangles[c, 2]
+        p0, p1, p2 = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        q0, q1, q2 = points[d, 0] - points[a, 0], points[d, 1] - points[a, 1], points[d, 2] - points[a, 2]
+        n0, n1, n2 = p1 * q2 - p2 * q1, p2 * q0 - p0 * q2, p0 * q1 - p1 * q0
+        for v in (a, b, d):
+            faces[v, 0] += n0
+            faces[v, 1] += n1
+            faces[v, 2] += n2
+    return faces
+
+
+@nb.njit(cache=True)
+def segment_normals(points, segments):
+    """Normals (V, 3), length-weighted, of a polyline in the plane of the first two axes: left of its direction."""
+    out = np.zeros_like(points)
+    for c in range(len(segments)):
+        a, b = segments[c, 0], segments[c, 1]
+        for v in (a, b):
+            out[v, 0] -= points[b, 1] - points[a, 1]
+            out[v, 1] += points[b, 0] - points[a, 0]
+    return out
+
+
+@nb.njit(cache=True)
+def ring_mean(normals, start, ring):
+    """Unit vectors: each normal, scaled to length 1, averaged with its ring's."""
+    unit = np.empty_like(normals)
+    for v in range(len(normals)):
+        size = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2) + 1e-30
+        for k in range(3):
+            unit[v, k] = normals[v, k] / size
+    out = np.empty_like(normals)
+    for v in range(len(normals)):
+        s0, s1, s2 = unit[v, 0], unit[v, 1], unit[v, 2]
+        for q in range(start[v], start[v + 1]):
+            w = ring[q]
+            s0 += unit[w, 0]
+            s1 += unit[w, 1]
+            s2 += unit[w, 2]
+        size = np.sqrt(s0 * s0 + s1 * s1 + s2 * s2) + 1e-30
+        out[v, 0], out[v, 1], out[v, 2] = s0 / size, s1 / size, s2 / size
+    return out
+
+
+@nb.njit(cache=True)
+def cubic_root(p0, p1, p2, p3, t):
+    """Zero in [0, 1] of the cubic through p0..p3 at -1, 0, 1, 2, by Newton from t; t itself where it leaves [0, 1]."""
+    c1 = -p0 / 3 - p1 / 2 + p2 - p3 / 6
+    c2 = (p0 + p2) / 2 - p1
+    c3 = (p3 - p0) / 6 + (p1 - p2) / 2
+    root = t
+    for _ in range(4):
+        slope = c1 + root * (2 * c2 + root * 3 * c3)
+        if slope == 0.0:
+            return t
+        root -= (p1 + root * (c1 + root * (c2 + root * c3))) / slope
+    return root if 0.0 <= root <= 1.0 else t
+
+
+@nb.njit(cache=True)
+def edge_of(ijk, low):
+    """Axis of the grid edge that a crossing lies on; its lower node goes into low (3,)."""
+    axis, widest = 0, -1.0
+    for a in range(3):
+        low[a] = int(np.round(ijk[a]))
+        off_node = abs(ijk[a] - low[a])
+        if off_node > widest:
+            axis, widest = a, off_node
+    low[axis] = int(np.floor(ijk[axis]))
+    return axis
+
+
+@nb.njit(cache=True)
+def gradient_on_edge(psi, low, axis, line, t, spacing, gradient):
+    """Gradient of Psi (per mm) at t along the edge from node `low`, into gradient (3,); False where a neighbour lacks.
+
+    Along the edge from the cubic through `line` (4,), across it from central differences at its two ends.
+    """
+    at = np.empty(3, np.int64)
+    for a in range(3):
+        if a == axis:
+            c1 = -line[0] / 3 - line[1] / 2 + line[2] - line[3] / 6
+            c2, c3 = (line[0] + line[2]) / 2 - line[1], (line[3] - line[0]) / 6 + (line[1] - line[2]) / 2
+            gradient[a] = (c1 + t * (2 * c2 + 3 * t * c3)) / spacing[a]
+            continue
+        gradient[a] = 0.0
+        if psi.shape[a] == 1:
+            continue
+        if low[a] < 1 or low[a] + 1 >= psi.shape[a]:
+            return False
+        for k in range(2):
+            at[:] = low
+            at[axis] += k
+            at[a] += 1
+            up = psi[at[0], at[1], at[2]]
+            at[a] -= 2
+            gradient[a] += (t if k == 1 else 1 - t) * (up - psi[at[0], at[1], at[2]]) / (2 * spacing[a])
+    return True
+
+
+@nb.njit(cache=True)
+def refine_crossings(psi, ijk, spacing, mesh_normals):
+    """Crossings (V, 3) moved to the zero of the cubic along their grid edge, and normals from differences of Psi.
+
+    Both only where Psi is smooth there; elsewhere the linear crossing and the mesh's own normal stay.
+    """
+    points, normals = ijk.copy(), mesh_normals.copy()
+    low, at, gradient, line = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(4)
+    for v in range(len(ijk)):
+        axis = edge_of(ijk[v], low)
+        if low[axis] < 1 or low[axis] + 2 >= psi.shape[axis]:
+            continue
+        at[:] = low
+        for k in range(4):
+            at[axis] = low[axis] - 1 + k
+            line[k] = psi[at[0], at[1], at[2]]
+        t = cubic_root(line[0], line[1], line[2], line[3], ijk[v, axis] - low[axis])
+        if not gradient_on_edge(psi, low, axis, line, t, spacing, gradient):
+            continue
+        size = np.sqrt((gradient**2).sum())
+        bend = max(abs(line[0] - 2 * line[1] + line[2]), abs(line[1] - 2 * line[2] + line[3]))
+        if bend <= SMOOTH * size * spacing[axis] and (gradient * mesh_normals[v]).sum() > 0.9 * size:
+            points[v, axis] = low[axis] + t
+            normals[v] = gradient / size
+    return points, normals
+
+
+@nb.njit(cache=True, parallel=True)
+def principal_curvatures(points, normals, start, ring, limit, ridge):
+    """Principal curvatures (V, 2), 1/mm, and the first's direction (V, 3): least squares of dn = S dx over two rings.
+
+    Positive where the surface bends away from its normal (a sphere's outward normal: 1/R). Clamped to +-limit (1/mm);
+    `ridge` (mm^2) damps the fit where the ring is too small to tell.
+    """
+    curvature, direction = np.zeros((len(points), 2)), np.zeros((len(points), 3))
+    for v in nb.prange(len(points)):
+        n = normals[v]
+        thin = 0
+        for k in range(1, 3):
+            if abs(n[k]) < abs(n[thin]):
+                thin = k
+        e1 = -n[thin] * n
+        e1[thin] += 1.0
+        e1 /= np.sqrt((e1**2).sum())
+        e2 = np.cross(n, e1)
+        xx = xy = yy = xp = cross = yq = 0.0
+        for q in range(start[v], start[v + 1]):
+            for o in range(start[ring[q]], start[ring[q] + 1]):
+                w = ring[o]
+                d0, d1, d2 = points[w, 0] - points[v, 0], points[w, 1] - points[v, 1], points[w, 2] - points[v, 2]
+                m0, m1, m2 = normals[w, 0] - n[0], normals[w, 1] - n[1], normals[w, 2] - n[2]
+                x, y = d0 * e1[0] + d1 * e1[1] + d2 * e1[2], d0 * e2[0] + d1 * e2[1] + d2 * e2[2]
+                p, r = m0 * e1[0] + m1 * e1[1] + m2 * e1[2], m0 * e2[0] + m1 * e2[1] + m2 * e2[2]
+                xx += x * x
+                xy += x * y
+                yy += y * y
+                xp += x * p
+                cross += y * p + x * r
+                yq += y * r
+        # Normal equations of [x y 0; 0 x y] [a b c] = [p q]; the corners are 0, so b comes first.
+        xx, yy = xx + ridge, yy + ridge
+        b = (cross - xy * (xp / xx + yq / yy)) / (xx + yy - ridge - xy * xy * (1 / xx + 1 / yy))
+        a, c = (xp - xy * b) / xx, (yq - xy * b) / yy
+        mean, spread = (a + c) / 2, np.sqrt(((a - c) / 2) ** 2 + b * b)
+        angle = 0.5 * np.arctan2(2 * b, a - c)
+        curvature[v, 0] = min(max(mean + spread, -limit), limit)
+        curvature[v, 1] = min(max(mean - spread, -limit), limit)
+        direction[v] = np.cos(angle) * e1 + np.sin(angle) * e2
+    return curvature, direction

@@ -1,0 +1,120 @@
+"""From any level-set volume to the mesh of its zero set, with normals and curvatures at the vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beltrami_cli.errors import DataError
+from beltrami_cli.kernels import mesh as kernels
+
+# Psi of exactly 0 at a node would make triangles without area: it is moved off by this share of the largest |Psi|.
+NUDGE = 1e-6
+# Least squares for curvature: rings smaller than this, in voxels, say little about it.
+RING_VOXELS = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class ZeroSurface:
+    """The zero level of Psi as a mesh.
+
+    points: (V, 3) float64, mm along the voxel axes (index times spacing).
+    cells: (C, 3) int32 triangles, or (C, 2) segments where the grid is a plane; counter-clockwise in index space seen
+        from the side of increasing Psi.
+    normals: (V, 3) unit vectors along the voxel axes, towards increasing Psi.
+    curvature, direction: (V, 2) principal curvatures, 1/mm, and (V, 3) direction of the first.
+    start, ring: neighbours of each vertex, (V + 1,) and (N,) int32.
+    """
+
+    points: np.ndarray
+    cells: np.ndarray
+    normals: np.ndarray
+    curvature: np.ndarray
+    direction: np.ndarray
+    start: np.ndarray
+    ring: np.ndarray
+
+
+def crossing_box(psi: np.ndarray, margin: tuple[int, ...]) -> tuple[slice, ...]:
+    """The part of the volume that holds every sign change of psi, widened by `margin` voxels per axis.
+
+    Raises DataError where psi has no zero level.
+    """
+    negative, finite = psi < 0, np.isfinite(psi)
+    low, high = np.full(3, np.iinfo(int).max), np.full(3, -1)
+    for axis in range(3):
+        a = tuple(slice(None, -1) if k == axis else slice(None) for k in range(3))
+        b = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
+        crossing = (negative[a] != negative[b]) & finite[a] & finite[b]
+        for k in range(3):
+            where = np.flatnonzero(crossing.any(tuple(m for m in range(3) if m != k)))
+            if len(where):
+                low[k] = min(low[k], where[0])
+                high[k] = max(high[k], where[-1] + (k == axis))
+    if high[0] < 0:
+        values = psi[finite]
+        found = f"values from {values.min():.6g} to {values.max():.6g}" if values.size else "no finite value"
+        raise DataError(
+            f"the level set has no zero level: found {found}, expected both signs "
+            "(Psi < 0 inside, > 0 outside; are LEVELSET and DATA swapped?)"
+        )
+    return tuple(
+        slice(max(0, int(low[k]) - margin[k]), min(psi.shape[k], int(high[k]) + 1 + margin[k])) for k in range(3)
+    )
+
+
+def zero_surface(psi: np.ndarray, spacing: np.ndarray) -> ZeroSurface:
+    """Marching cubes (marching squares in a plane, the last axis having length 1) at Psi = 0.
+
+    psi: (nx, ny, nz), NaN or inf where unknown. spacing: (3,) mm. Raises DataError where nothing is crossed.
+    """
+    psi = np.ascontiguousarray(psi, np.float32)
+    finite = np.isfinite(psi)
+    scale = np.abs(psi, where=finite, out=np.zeros_like(psi)).max()
+    psi = np.where(np.abs(psi) < NUDGE * scale, np.float32(NUDGE * scale), psi)
+    ijk, cells = (contour if psi.shape[2] == 1 else isosurface)(psi, finite)
+    if not len(cells):
+        raise DataError("the level set has no zero level among its finite values")
+    points = ijk * spacing
+    start, ring = kernels.half_edges(cells, len(points))
+    raw = kernels.segment_normals(points, cells) if cells.shape[1] == 2 else kernels.face_normals(points, cells)
+    mesh_normals = kernels.ring_mean(raw, start, ring)
+    ijk, normals = kernels.refine_crossings(psi, ijk, spacing, mesh_normals)
+    points = ijk * spacing
+    voxel = spacing[: 3 if psi.shape[2] > 1 else 2].min()
+    curvature, direction = kernels.principal_curvatures(
+        points, normals, start, ring, 1 / voxel, (RING_VOXELS * voxel) ** 2
+    )
+    return ZeroSurface(points, cells, normals, curvature, direction, start, ring)
+
+
+def isosurface(psi: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) in voxel indices and triangles (C, 3), facing increasing psi."""
+    from skimage.measure import marching_cubes
+
+    try:
+        ijk, cells, _, _ = marching_cubes(
+            psi, 0.0, mask=None if finite.all() else finite
+        )
+    except (ValueError, RuntimeError):  # no cell is crossed among the finite values
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
+    return ijk.astype(np.float64), cells.astype(np.int32)
+
+
+def contour(psi: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) in voxel indices and segments (C, 2) with increasing psi on their left."""
+    from skimage.measure import find_contours
+
+    points, segments, count = [], [], 0
+    for line in find_contours(psi[:, :, 0], 0.0, positive_orientation="low", mask=finite[:, :, 0]):
+        closed = len(line) > 2 and bool((line[0] == line[-1]).all())
+        line = line[:-1] if closed else line
+        index = np.arange(len(line))
+        following = np.roll(index, -1) if closed else index[1:]
+        segments.append(count + np.stack([index[: len(following)], following], 1))
+        points.append(np.c_[line, np.zeros(len(line))])
+        count += len(line)
+    if not points:
+        return np.zeros((0, 3)), np.zeros((0, 2), np.int32)
+    return np.concatenate(points), np.concatenate(segments).astype(np.int32)

@@ -1,0 +1,130 @@
+"""How far two arrays differ: the figures that `beltrami compare` prints and judges."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from beltrami_cli.errors import DataError, RefusedError
+
+
+@dataclass(frozen=True)
+class Difference:
+    """B minus A over the voxels where both have a finite value, in data units.
+
+    compared: voxels where both are finite. only_in_a, only_in_b: voxels where only the one is.
+    data_range: what psnr counts as the full scale. psnr: 20 log10(data_range / rms) in dB, inf where A equals B.
+    correlation: Pearson's, or the circular coefficient for angles; NaN where A or B is constant.
+    """
+
+    compared: int
+    only_in_a: int
+    only_in_b: int
+    max_abs: float
+    rms: float
+    mean: float
+    data_range: float
+    psnr: float
+    correlation: float
+
+    def exceeds(
+        self, *, max_abs: float | None = None, max_rms: float | None = None, min_psnr: float | None = None
+    ) -> list[str]:
+        """One line for each tolerance that is broken; an empty list where all hold. None is no tolerance."""
+        lines = []
+        if max_abs is not None and not self.max_abs <= max_abs:
+            lines.append(f"largest difference {self.max_abs:.6g} is over {max_abs:g}")
+        if max_rms is not None and not self.rms <= max_rms:
+            lines.append(f"rms difference {self.rms:.6g} is over {max_rms:g}")
+        if min_psnr is not None and not self.psnr >= min_psnr:
+            lines.append(f"PSNR {self.psnr:.2f} dB is under {min_psnr:g} dB")
+        return lines
+
+    def as_dict(self) -> dict[str, int | float | None]:
+        """The fields by name, for JSON: what is not a finite number there (psnr of equal arrays) is None."""
+        return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
+
+
+def difference(
+    a: np.ndarray,
+    b: np.ndarray,
+    *,
+    mask: np.ndarray | None = None,
+    period: float | None = None,
+    data_range: float | None = None,
+) -> Difference:
+    """Compare B with the reference A, arrays of one shape; NaN and infinite values count as missing.
+
+    mask: of the same shape; only where it is true (not zero) is looked at.
+    period: the values are angles of this period, and differences are wrapped to -period/2 .. period/2.
+    data_range: full scale for PSNR in data units; by default A's range over the compared voxels, or the period.
+    Raises RefusedError for shapes that differ or a period or range that is not positive, DataError where no voxel
+    has a value in both.
+    """
+    for name, size in (("period", period), ("data range", data_range)):
+        if size is not None and not 0 < size < math.inf:
+            raise RefusedError(f"{name} of the comparison: found {size:g}, expected a finite number above 0")
+    if a.shape != b.shape or (mask is not None and mask.shape != a.shape):
+        shapes = [array.shape for array in (a, b, mask) if array is not None]
+        raise RefusedError(
+            f"shapes differ: found {', '.join(map(str, shapes))}, expected one shape for all that is compared"
+        )
+    looked_at = np.ones(a.shape, bool) if mask is None else mask != 0
+    in_a, in_b = np.isfinite(a) & looked_at, np.isfinite(b) & looked_at
+    both = in_a & in_b
+    if not both.any():
+        raise DataError(
+            f"nothing to compare: of {looked_at.sum()} voxels looked at, {in_a.sum()} have a value in A and "
+            f"{in_b.sum()} in B, none in both"
+        )
+    x, y = a[both].astype(float), b[both].astype(float)
+    with np.errstate(over="ignore", invalid="ignore"):  # near 1e308 a figure may be inf, which breaks any tolerance
+        d = y - x if period is None else wrapped(y - x, period)
+        rms = float(np.sqrt(np.mean(d**2)))
+        scale = data_range or period or float(x.max() - x.min())
+        return Difference(
+            compared=int(both.sum()),
+            only_in_a=int((in_a & ~both).sum()),
+            only_in_b=int((in_b & ~both).sum()),
+            max_abs=float(np.abs(d).max()),
+            rms=rms,
+            mean=float(d.mean()),
+            data_range=scale,
+            psnr=_psnr(scale, rms),
+            correlation=_correlation(x, y) if period is None else _circular_correlation(x, y, period),
+        )
+
+
+def wrapped(d: np.ndarray, period: float) -> np.ndarray:
+    """Differences of angles (data units) brought to -period/2 <= d < period/2."""
+    return (d + period / 2) % period - period / 2
+
+
+def _psnr(data_range: float, rms: float) -> float:
+    """dB; inf for rms = 0, -inf for a range of 0 or rms = inf."""
+    if rms == 0:
+        return math.inf
+    if data_range == 0 or rms == math.inf:
+        return -math.inf
+    return 20 * math.log10(data_range / rms)
+
+
+def _correlation(x: np.ndarray, y: np.ndarray) -> float:
+    """Pearson's coefficient; NaN where x or y is constant."""
+    if np.ptp(x) == 0 or np.ptp(y) == 0:
+        return math.nan
+    return _normalised_product(x - x.mean(), y - y.mean())
+
+
+def _circular_correlation(x: np.ndarray, y: np.ndarray, period: float) -> float:
+    """The coefficient of Jammalamadaka and SenGupta: Pearson's with sines of deviations from the mean direction."""
+    turn = 2 * np.pi / period
+    p, q = (np.sin(turn * t - np.angle(np.exp(1j * turn * t).mean())) for t in (x, y))
+    return _normalised_product(p, q)
+
+
+def _normalised_product(p: np.ndarray, q: np.ndarray) -> float:
+    size = math.sqrt(float(p @ p) * float(q @ q))
+    return float(p @ q) / size if size > 0 else math.nan

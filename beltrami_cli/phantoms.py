@@ -1,0 +1,217 @@
+"""Surfaces with known data: a level set, the clean values and the noisy ones, made from formulas.
+
+Psi is in voxels of 1 mm and negative inside. Clean values fill the whole volume: a voxel holds the value at its nearest
+surface point, so that they are constant along normals. Noise is Gaussian, independent in every voxel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from beltrami_cli.errors import RefusedError
+from beltrami_cli.grid import Grid, Volume
+
+# A symmetric place hides errors and puts zeros of Psi on voxels: the centre lies off every voxel and face (in voxels).
+OFF_GRID = 0.137
+
+# Below, the tube of the torus has a radius under 2 voxels; above, the formulas' float64 arrays take more than 10 GB.
+SIZES = (16, 512)
+
+
+@dataclass(frozen=True, eq=False)
+class Phantom:
+    """A surface and the data on it, on one grid.
+
+    levelset, clean, noisy: float32 arrays of one shape: (size, size, size), or (size, size) for the curve.
+    grid: voxels of 1 mm; its shape has a third axis of length 1 for the curve.
+    """
+
+    levelset: np.ndarray
+    clean: np.ndarray
+    noisy: np.ndarray
+    grid: Grid
+
+    def volumes(self) -> dict[str, Volume]:
+        """`levelset`, `clean` and `noisy` as volumes that remember the arrays' own shape."""
+        arrays = {"levelset": self.levelset, "clean": self.clean, "noisy": self.noisy}
+        return {name: Volume(a.reshape(self.grid.shape), self.grid, a.shape) for name, a in arrays.items()}
+
+
+def torus(size: int = 64, *, noise: float = 40.0, seed: int = 0, map: str = "mixed") -> Phantom:
+    """Torus with radii 18 and 8 voxels at size 64 (5,700 voxels with |Psi| < 0.5; size 95 has the paper's 12,500).
+
+    map: with theta around the axis and phi around the tube,
+    `mixed`  90 + 50 cos 2phi where sin 2theta > 0, else 180 + 40 sin 3theta: smooth parts and borders;
+    `pieces` 200 where sin 3theta sin 2phi > 0, else 60;
+    `smooth` 128 + 60 sin 2theta + 40 cos 3phi.
+    """
+    x, y, z = _centred(size, 3)
+    ring = np.hypot(x, y) - 18 * size / 64
+    psi = np.hypot(ring, z) - 8 * size / 64
+    theta, phi = np.arctan2(y, x), np.arctan2(z, ring)
+    if map == "mixed":
+        clean = np.where(np.sin(2 * theta) > 0, 90 + 50 * np.cos(2 * phi), 180 + 40 * np.sin(3 * theta))
+    elif map == "pieces":
+        clean = np.where(np.sin(3 * theta) * np.sin(2 * phi) > 0, 200.0, 60.0)
+    elif map == "smooth":
+        clean = 128 + 60 * np.sin(2 * theta) + 40 * np.cos(3 * phi)
+    else:
+        raise RefusedError(f"map of the torus: found {map!r}, expected mixed, pieces or smooth")
+    return _phantom(psi, clean, noise, seed)
+
+
+def sphere(size: int = 48, *, noise: float = 40.0, seed: int = 0) -> Phantom:
+    """Sphere of radius size/3 with 85 + 85 (3 cos^2 - 1), 0 to 255, cos measured from the axis (1, 2, 2)/3.
+
+    The pattern is a spherical harmonic of degree 2: heat flow scales its second term by exp(-6 t / R^2).
+    """
+    x = _centred(size, 3)
+    radius = np.sqrt((x**2).sum(0))
+    cosine = np.tensordot(np.array([1, 2, 2]) / 3, x, 1) / radius
+    return _phantom(radius - size / 3, 255 * cosine**2, noise, seed)
+
+
+def plane(size: int = 48, *, noise: float = 40.0, seed: int = 0) -> Phantom:
+    """Oblique plane with normal (1, 2, 3): values ramp by 70 over `size` voxels, with an edge of 110 along the ramp."""
+    x = _centred(size, 3)
+    psi, along, across = (
+        np.tensordot(np.array(axis) / np.linalg.norm(axis), x, 1) for axis in ((1, 2, 3), (3, 0, -1), (1, -5, 3))
+    )
+    return _phantom(psi, 70 + 70 * along / size + np.where(across > 0, 110.0, 0.0), noise, seed)
+
+
+def curve(size: int = 128, *, noise: float = 15.0, seed: int = 0) -> Phantom:
+    """Closed curve r(t) = 0.3 size (1 + 0.18 cos 3t) in a plane, with 128 + 45 sin 2t, raised by 60 on 0.8 < t < 2.2
+    and lowered by 60 on 4 < t < 5: four jumps. The arrays have two axes."""
+    x = _centred(size, 2)
+    t = _nearest_parameter(x, 0.3 * size)
+    inside = np.hypot(*x) < np.hypot(*_trefoil(np.arctan2(x[1], x[0]), 0.3 * size)[0])
+    distance = np.hypot(*(x - _trefoil(t, 0.3 * size)[0]))
+    jumps = np.where((t > 0.8) & (t < 2.2), 60.0, 0.0) - np.where((t > 4) & (t < 5), 60.0, 0.0)
+    return _phantom(np.where(inside, -distance, distance), 128 + 45 * np.sin(2 * t) + jumps, noise, seed)
+
+
+def portrait(size: int = 64, *, noise: float = 40.0, seed: int = 0) -> Phantom:
+    """A grey portrait (Eileen Collins, by NASA, in the public domain) on an ellipsoid; size 140 has 2,744,000 voxels.
+
+    The picture, 0 to 255, is projected along the second axis onto the front, its mirror image onto the back.
+    """
+    from scipy.ndimage import map_coordinates
+    from skimage import data
+    from skimage.color import rgb2gray
+    from skimage.transform import resize
+
+    axes = np.array([0.36, 0.30, 0.42]) * size
+    x = _centred(size, 3)
+    nearest = _nearest_on_ellipsoid(x, axes)
+    outside = np.tensordot(1 / axes**2, x**2, 1) > 1
+    distance = np.sqrt(((x - nearest) ** 2).sum(0))
+
+    head = rgb2gray(data.astronaut())[0:256, 104:324]
+    # One pixel per voxel where the surface faces the viewer: finer detail would only alias.
+    rows, columns = (2 * round(float(a)) for a in axes[[2, 0]])
+    picture = 255 * resize(head, (rows, columns), anti_aliasing=True)
+    row = (1 - nearest[2] / axes[2]) / 2 * (rows - 1)
+    column = (1 - nearest[0] / axes[0]) / 2 * (columns - 1)  # seen from the front, +x (right) is on the left
+    clean = map_coordinates(picture, [row, column], order=1, mode="nearest")
+    return _phantom(np.where(outside, distance, -distance), clean, noise, seed)
+
+
+def sulcus(
+    size: int = 48,
+    *,
+    noise: float = 5.0,
+    seed: int = 0,
+    gap: float = 2.0,
+    direction: tuple[float, float, float] = (0.9, -0.5, 0.4),
+) -> Phantom:
+    """Two wavy banks of tissue (Psi < 0) at means 0 and 100, facing each other across a gap (Psi > 0).
+
+    gap: width between the banks in voxels. direction: from the bank at 0 to the bank at 100.
+    With s = direction . x + 1.4 sin(y/6.5 + 0.3) cos(z/7.5), Psi = gap/2 - |s|: near a distance, not exactly one.
+    """
+    if not gap > 0:
+        raise RefusedError(f"gap of the sulcus: found {gap:g}, expected a width above 0 voxels")
+    x = _centred(size, 3, off_grid=0.0)
+    axis = np.array(direction) / np.linalg.norm(direction)
+    s = np.tensordot(axis, x, 1) + 1.4 * np.sin(x[1] / 6.5 + 0.3) * np.cos(x[2] / 7.5)
+    return _phantom(gap / 2 - np.abs(s), np.where(s > 0, 100.0, 0.0), noise, seed)
+
+
+PHANTOMS: dict[str, Callable[..., Phantom]] = {
+    "torus": torus,
+    "sphere": sphere,
+    "plane": plane,
+    "curve": curve,
+    "portrait": portrait,
+    "sulcus": sulcus,
+}
+
+
+def make(name: str, *, size: int | None = None, noise: float | None = None, seed: int = 0, **options: Any) -> Phantom:
+    """The phantom of that name; None leaves its own default, `options` are its own keywords (map, gap, direction).
+
+    Raises RefusedError for an unknown name or a value out of range.
+    """
+    if name not in PHANTOMS:
+        raise RefusedError(f"phantom: found {name!r}, expected one of {', '.join(PHANTOMS)}")
+    if size is not None:
+        options["size"] = size
+    if noise is not None:
+        options["noise"] = noise
+    return PHANTOMS[name](seed=seed, **options)
+
+
+def _centred(size: int, dimensions: int, *, off_grid: float = OFF_GRID) -> np.ndarray:
+    """(dimensions, size, ...) coordinates in voxels from a centre that is off the grid's own by -off_grid."""
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise RefusedError(f"size of the phantom: found {size}, expected {SIZES[0]} to {SIZES[1]} voxels")
+    return np.indices((size,) * dimensions) - ((size - 1) / 2 - off_grid)
+
+
+def _phantom(psi: np.ndarray, clean: np.ndarray, noise: float, seed: int) -> Phantom:
+    """float32 arrays on a grid of 1 mm; `noise` is the standard deviation in data units."""
+    if not 0 <= noise < np.inf:
+        raise RefusedError(f"noise of the phantom: found {noise:g}, expected a finite standard deviation of at least 0")
+    if seed < 0:
+        raise RefusedError(f"seed of the phantom: found {seed}, expected a whole number of at least 0")
+    noisy = clean + noise * np.random.default_rng(seed).standard_normal(clean.shape)
+    single = np.float32
+    return Phantom(psi.astype(single), clean.astype(single), noisy.astype(single), Grid.from_spacing(clean.shape))
+
+
+def _trefoil(t: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (2, ...) of the curve r(t) = radius (1 + 0.18 cos 3t), and their derivatives by t."""
+    r, dr = radius * (1 + 0.18 * np.cos(3 * t)), -0.54 * radius * np.sin(3 * t)
+    c, s = np.cos(t), np.sin(t)
+    return np.stack([r * c, r * s]), np.stack([dr * c - r * s, dr * s + r * c])
+
+
+def _nearest_parameter(x: np.ndarray, radius: float) -> np.ndarray:
+    """t in [0, 2 pi) of the curve's point nearest to each x (2, ...)."""
+    from scipy.spatial import cKDTree
+
+    samples = np.linspace(0, 2 * np.pi, 8192, endpoint=False)
+    t = samples[cKDTree(_trefoil(samples, radius)[0].T).query(x.reshape(2, -1).T)[1]].reshape(x.shape[1:])
+    # One Gauss-Newton step along the tangent: the samples' spacing enters the distance squared, below float32.
+    point, tangent = _trefoil(t, radius)
+    t += ((x - point) * tangent).sum(0) / (tangent**2).sum(0)
+    return t % (2 * np.pi)
+
+
+def _nearest_on_ellipsoid(x: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """The point of the ellipsoid with semi-axes `axes` (3,) nearest to each x (3, ...), all in voxels.
+
+    It is axes^2 x / (t + axes^2) with t the root of sum (axes x / (t + axes^2))^2 = 1: a convex function of t, so that
+    Newton's steps climb to the root from the left, where one term alone is 1.
+    """
+    a = axes.reshape(3, *[1] * (x.ndim - 1))
+    t = (a * np.abs(x) - a**2).max(0)
+    for _ in range(12):
+        share = (a * x / (t + a**2)) ** 2
+        t += (share.sum(0) - 1) / (2 * (share / (t + a**2)).sum(0))
+    return a**2 * x / (t + a**2)

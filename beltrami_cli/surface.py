@@ -1,0 +1,21 @@
+"""The surface as a mesh in world space, with the values that lie on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangulated surface, or a polyline where the surface is a curve in a plane.
+
+    vertices_ras_mm: (V, 3) float64 in RAS mm.
+    cells: (C, 3) int32 triangles, counter-clockwise seen from outside; (C, 2) segments for a curve.
+    values: (V,) data values, NaN where missing; None for geometry alone.
+    """
+
+    vertices_ras_mm: np.ndarray
+    cells: np.ndarray
+    values: np.ndarray | None = None

@@ -1,0 +1,57 @@
+"""The package as a whole: what it depends on, how it starts, and what its start must not load."""
+
+import ast
+import importlib
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import beltrami_cli
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+HEAVY = {"SimpleITK", "matplotlib", "meshio", "nibabel", "numba", "scipy", "skimage", "tqdm", "trimesh"}
+
+
+def run(*arguments: str) -> str:
+    return subprocess.run([sys.executable, *arguments], check=True, capture_output=True, text=True).stdout
+
+
+def imported_packages() -> set[str]:
+    names = set()
+    for file in (ROOT / "beltrami_cli").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names.add(node.module.split(".")[0])
+    return names - set(sys.stdlib_module_names) - {"beltrami_cli"}
+
+
+def test_dependencies_are_what_the_package_imports():
+    extras = PROJECT["optional-dependencies"]
+    packages = {requirement.split(">=")[0] for requirement in PROJECT["dependencies"]}
+    imported = {{"skimage": "scikit-image"}.get(name, name) for name in imported_packages()}
+    optional = {requirement.split(">=")[0] for requirement in extras["report"]}
+    assert imported - optional == packages
+
+
+def test_console_script_and_module_are_one_command():
+    module, function = PROJECT["scripts"]["beltrami"].split(":")
+    assert callable(getattr(importlib.import_module(module), function))
+    assert beltrami_cli.__version__ in run("-m", "beltrami_cli", "--version")
+
+
+@pytest.mark.parametrize("module", ["beltrami_cli", "beltrami_cli.cli", "beltrami_cli.formats"])
+def test_start_loads_no_heavy_package(module):
+    loaded = set(run("-c", f"import {module}, sys; print(*sys.modules)").split())
+    assert module in loaded
+    assert loaded & HEAVY == set()
+
+
+def test_every_module_says_what_it_is_about():
+    files = [f for f in (ROOT / "beltrami_cli").rglob("*.py") if f.read_text().strip()]
+    assert [f.name for f in files if not ast.get_docstring(ast.parse(f.read_text()))] == []

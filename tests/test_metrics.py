@@ -1,0 +1,100 @@
+"""The figures of a comparison, and the tolerances that judge them."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.metrics import difference, wrapped
+
+RNG = np.random.default_rng(5)
+A = RNG.normal(100, 20, (6, 5, 4))
+
+
+def test_figures_of_known_differences():
+    b = A + np.where(np.arange(A.size).reshape(A.shape) % 2, 3.0, -1.0)
+    d = difference(A, b)
+    assert (d.compared, d.only_in_a, d.only_in_b) == (A.size, 0, 0)
+    assert d.max_abs == pytest.approx(3) and d.mean == pytest.approx(1) and d.rms == pytest.approx(math.sqrt(5))
+    assert d.data_range == np.ptp(A)
+    assert d.psnr == pytest.approx(10 * math.log10(np.ptp(A) ** 2 / 5))
+    assert d.correlation == pytest.approx(np.corrcoef(A.ravel(), b.ravel())[0, 1])
+    assert difference(A, b, data_range=255).psnr == pytest.approx(10 * math.log10(255**2 / 5))
+
+
+def test_equal_arrays_have_infinite_psnr_and_null_in_json():
+    d = difference(A, A)
+    assert (d.max_abs, d.rms, d.mean, d.psnr) == (0, 0, 0, math.inf)
+    assert d.correlation == pytest.approx(1)
+    assert json.loads(json.dumps(d.as_dict(), allow_nan=False))["psnr"] is None
+    assert d.exceeds(max_abs=0, max_rms=0, min_psnr=100) == []
+
+
+def test_missing_values_are_counted_not_compared():
+    a, b = A.copy(), A + 1
+    a[0, 0, :2] = np.nan
+    b[1, :3, 0] = np.nan
+    b[0, 0, 0] = np.inf
+    d = difference(a, b)
+    assert (d.compared, d.only_in_a, d.only_in_b) == (A.size - 5, 3, 1)
+    assert d.max_abs == pytest.approx(1) and d.mean == pytest.approx(1)
+
+
+def test_mask_limits_what_is_looked_at():
+    b = A.copy()
+    b[0] += 50
+    b[1, 0, 0] = np.nan
+    mask = np.zeros(A.shape, np.uint8)
+    mask[1:3] = 2
+    d = difference(A, b, mask=mask)
+    assert (d.compared, d.only_in_a, d.max_abs) == (2 * 20 - 1, 1, 0)
+
+
+def test_angles_differ_the_short_way_round():
+    a, b = np.array([359.0, 10.0, 90.0, 200.0]), np.array([2.0, 350.0, 95.0, 200.0])
+    d = difference(a, b, period=360)
+    assert d.max_abs == pytest.approx(20) and d.mean == pytest.approx((3 - 20 + 5) / 4) and d.data_range == 360
+    assert d.correlation == pytest.approx(0.96, abs=0.01)
+    assert difference(a, b + 720, period=360).rms == pytest.approx(d.rms)
+    assert difference(a, a + 360, period=360).rms < 1e-12
+    assert np.allclose(wrapped(np.array([-0.6, 0.4, 0.5, 1.2]), 1.0), [0.4, 0.4, -0.5, 0.2])
+
+
+def test_constant_data_have_no_correlation():
+    d = difference(np.full(5, 2.0), np.arange(5.0))
+    assert math.isnan(d.correlation) and d.as_dict()["correlation"] is None
+    assert d.psnr == -math.inf and d.exceeds(min_psnr=0) != []
+    assert math.isnan(difference(np.full(5, 2.0), np.full(5, 3.0), period=360).correlation)
+
+
+def test_each_broken_tolerance_has_its_line():
+    d = difference(A, A + 2, data_range=200)
+    assert d.psnr == pytest.approx(40)
+    assert d.exceeds() == [] and d.exceeds(max_abs=2.001, max_rms=2.001, min_psnr=39.9) == []
+    lines = d.exceeds(max_abs=1.5, max_rms=1, min_psnr=45)
+    assert lines == ["largest difference 2 is over 1.5", "rms difference 2 is over 1", "PSNR 40.00 dB is under 45 dB"]
+
+
+def test_integers_and_huge_values_do_not_overflow():
+    assert difference(np.array([0, 255], np.uint8), np.array([255, 0], np.uint8)).max_abs == 255
+    assert difference(np.array([0.0, 1e200]), np.array([1e200, 0.0])).exceeds(max_rms=1) != []
+
+
+@pytest.mark.parametrize("options", [{"period": 0}, {"period": -1}, {"data_range": float("nan")}, {"data_range": 0}])
+def test_scales_that_are_not_positive_are_refused(options):
+    with pytest.raises(RefusedError, match="expected a finite number above 0"):
+        difference(A, A, **options)
+
+
+def test_shapes_that_differ_are_refused():
+    with pytest.raises(RefusedError, match=r"\(6, 5, 4\), \(6, 5\)"):
+        difference(A, A[..., 0])
+    with pytest.raises(RefusedError, match="shapes differ"):
+        difference(A, A, mask=np.ones((6, 5)))
+
+
+def test_no_voxel_in_common_is_an_error():
+    with pytest.raises(DataError, match="120 have a value in A and 0 in B"):
+        difference(A, np.full(A.shape, np.nan))

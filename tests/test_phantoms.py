@@ -1,0 +1,146 @@
+"""Phantoms: level sets that are distances, clean values constant along normals, noise of the stated size."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from beltrami_cli import phantoms
+from beltrami_cli.errors import RefusedError
+
+DISTANCES = ["torus", "sphere", "plane", "curve", "portrait"]
+
+
+@pytest.mark.parametrize("name", phantoms.PHANTOMS)
+def test_arrays_share_a_grid_and_noise_has_its_size(name):
+    phantom = phantoms.make(name, noise=7.0, seed=3)
+    shape = phantom.clean.shape
+    assert phantom.levelset.shape == phantom.noisy.shape == shape
+    assert phantom.grid.shape == (*shape, 1)[:3]
+    assert {a.dtype for a in (phantom.levelset, phantom.clean, phantom.noisy)} == {np.dtype("float32")}
+    assert np.all(phantom.grid.spacing == 1.0)
+    noise = (phantom.noisy - phantom.clean).astype(float)
+    assert abs(noise.std() - 7.0) < 7.0 * 3 / np.sqrt(2 * noise.size)
+    assert phantom.clean.min() >= 0 and phantom.clean.max() <= 255
+    assert phantom.levelset.min() < 0 < phantom.levelset.max()
+
+
+@pytest.mark.parametrize("name", phantoms.PHANTOMS)
+def test_seed_decides_the_noise(name):
+    first, again, other = (phantoms.make(name, size=24, seed=seed) for seed in (1, 1, 2))
+    assert np.array_equal(first.noisy, again.noisy)
+    assert not np.array_equal(first.noisy, other.noisy)
+    assert np.array_equal(first.clean, other.clean)
+
+
+@pytest.mark.parametrize("name", DISTANCES)
+def test_level_set_is_a_signed_distance_negative_inside(name):
+    psi = phantoms.make(name).levelset.astype(float)
+    slope = np.sqrt(sum(d**2 for d in np.gradient(psi)))
+    band = np.abs(psi) < 3
+    # Central differences of an exact distance fall short by the curvature squared: at most 1 % at 8 voxels' radius.
+    assert slope[band].min() > 0.985 and slope[band].max() < 1.001
+    if name != "plane":
+        assert psi[(0,) * psi.ndim] > 0
+
+
+@pytest.mark.parametrize("name", ["torus", "sphere", "plane", "curve", "portrait"])
+def test_clean_values_are_constant_along_normals(name):
+    options = {"map": "smooth"} if name == "torus" else {}
+    phantom = phantoms.make(name, **options)
+    psi, clean = phantom.levelset.astype(float), phantom.clean.astype(float)
+    x = np.argwhere(np.abs(psi) < 2.5).T
+    normal = np.array(np.gradient(psi))[(slice(None), *x)]
+    inner = np.all((x > 4) & (x < psi.shape[0] - 5), axis=0)
+    at_surface = map_coordinates(clean, (x - psi[tuple(x)] * normal)[:, inner], order=1)
+    gap = np.abs(at_surface - clean[tuple(x)][inner])
+    # Voxels beside an edge of the data interpolate across it: half of all are compared.
+    assert np.median(gap) < 1.0
+
+
+def test_torus_has_the_stated_radii_and_surface():
+    phantom = phantoms.torus()
+    surface = np.count_nonzero(np.abs(phantom.levelset) < 0.5)
+    assert abs(surface - 4 * np.pi**2 * 18 * 8) < 60
+    centre = 31.5 - phantoms.OFF_GRID
+    assert phantom.levelset[57, 40, 35] == pytest.approx(
+        np.hypot(np.hypot(57 - centre, 40 - centre) - 18, 35 - centre) - 8, abs=1e-5
+    )
+    assert abs(np.count_nonzero(np.abs(phantoms.torus(95).levelset) < 0.5) - 12_500) < 100
+
+
+def test_torus_maps_take_the_values_of_their_formulas():
+    centre = 31.5 - phantoms.OFF_GRID
+    x, y, z = 50 - centre, 45 - centre, 36 - centre
+    theta, phi = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y) - 18)
+    mixed, pieces, smooth = (float(phantoms.torus(map=m).clean[50, 45, 36]) for m in ("mixed", "pieces", "smooth"))
+    assert np.sin(2 * theta) > 0 and mixed == pytest.approx(90 + 50 * np.cos(2 * phi), abs=1e-4)
+    assert pieces == (200 if np.sin(3 * theta) * np.sin(2 * phi) > 0 else 60)
+    assert smooth == pytest.approx(128 + 60 * np.sin(2 * theta) + 40 * np.cos(3 * phi), abs=1e-4)
+    assert set(np.unique(phantoms.torus(map="pieces").clean)) == {60, 200}
+
+
+def test_sphere_pattern_is_a_harmonic_about_its_axis():
+    phantom = phantoms.sphere()
+    # A harmonic has mean 0 over the sphere; a thick shell evens out where the voxels happen to lie.
+    assert phantom.clean[np.abs(phantom.levelset) < 4].mean() == pytest.approx(85, abs=0.5)
+    centre = 23.5 - phantoms.OFF_GRID
+    pole = np.round(centre + 16 * np.array([1, 2, 2]) / 3).astype(int)
+    assert abs(phantom.levelset[tuple(pole)]) < 1 and phantom.clean[tuple(pole)] > 250
+
+
+def test_curve_jumps_where_it_says():
+    phantom = phantoms.curve(noise=0)
+    assert phantom.clean.shape == (128, 128)
+    assert np.array_equal(phantom.clean, phantom.noisy)
+    x = np.indices((128, 128)) - (63.5 - phantoms.OFF_GRID)
+    # On the curve, where it is farthest from the centre, at t = 0 and 2 pi/3.
+    for t, value in ((0.0, 128.0), (2 * np.pi / 3, 128 + 45 * np.sin(4 * np.pi / 3) + 60)):
+        point = 0.3 * 128 * 1.18 * np.array([np.cos(t), np.sin(t)])
+        nearest = np.unravel_index(np.hypot(*(x - point[:, None, None])).argmin(), (128, 128))
+        assert abs(phantom.levelset[nearest]) < 0.75
+        assert phantom.clean[nearest] == pytest.approx(value, abs=3.0)
+
+
+def test_portrait_at_140_has_the_voxels_of_the_paper():
+    phantom = phantoms.portrait(32)
+    assert 140**3 == 2_744_000
+    front, back = phantom.clean[:, -1, :], phantom.clean[:, 0, :]
+    # The mirror image on the back: one picture, seen through (the centre's offset moves it a little).
+    assert np.corrcoef(front[4:-4, 4:-4].ravel(), back[4:-4, 4:-4].ravel())[0, 1] > 0.95
+    assert phantom.clean[np.abs(phantom.levelset) < 0.5].std() > 40
+
+
+@pytest.mark.parametrize("gap", [1.5, 3.0])
+@pytest.mark.parametrize("direction", [(0.9, -0.5, 0.4), (1, 1, 1)])
+def test_sulcus_has_two_banks_at_the_gap(gap, direction):
+    phantom = phantoms.sulcus(gap=gap, direction=direction)
+    x = np.indices((48, 48, 48)) - 23.5
+    axis = np.array(direction) / np.linalg.norm(direction)
+    s = np.tensordot(axis, x, 1) + 1.4 * np.sin(x[1] / 6.5 + 0.3) * np.cos(x[2] / 7.5)
+    assert np.allclose(phantom.levelset, gap / 2 - np.abs(s), atol=1e-5)
+    assert np.all(phantom.clean[s > 0] == 100) and np.all(phantom.clean[s < 0] == 0)
+    assert np.count_nonzero(phantom.levelset > 0) == pytest.approx(gap * 48**2 / axis.max(), rel=0.35)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: phantoms.make("cube"), "found 'cube', expected one of torus, sphere"),
+        (lambda: phantoms.make("torus", map="plaid"), "found 'plaid', expected mixed"),
+        (lambda: phantoms.make("sphere", size=3), "found 3, expected 16 to 512"),
+        (lambda: phantoms.make("sphere", size=4096), "found 4096, expected 16 to 512"),
+        (lambda: phantoms.make("plane", size=16, noise=-1), "found -1"),
+        (lambda: phantoms.make("plane", size=16, noise=float("nan")), "found nan"),
+        (lambda: phantoms.make("plane", size=16, seed=-1), "found -1"),
+        (lambda: phantoms.sulcus(gap=0), "found 0, expected a width"),
+    ],
+)
+def test_values_out_of_range_are_refused(call, message):
+    with pytest.raises(RefusedError, match=message):
+        call()
+
+
+def test_volumes_remember_the_shape_of_the_arrays():
+    volumes = phantoms.curve(32).volumes()
+    assert list(volumes) == ["levelset", "clean", "noisy"]
+    assert all(v.data.shape == (32, 32, 1) and v.file_shape == (32, 32) for v in volumes.values())
