@@ -7,9 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from beltrami_cli.errors import DataError
 from beltrami_cli.grid import Grid
-from beltrami_cli.kernels import interpolate, sheets
+from beltrami_cli.kernels import sheets
 from beltrami_cli.levelset import ZeroSurface, crossing_box, zero_surface
 
 
@@ -101,3 +100,27 @@ def build_band(psi: np.ndarray, grid: Grid, half_width: float) -> Band:
         )
         forward[axis], backward[axis] = sheets.mutual_links(up, down)
     return Band(grid, box, half_width, surface, voxel, first, vertex, normal, distance, forward, backward)
+
+
+def flat_band(grid: Grid) -> Band:
+    """Every voxel an entry, linked to its neighbours, and no normal: P = I, the flows of Eqs. 10-11."""
+    count = int(np.prod(grid.shape))
+    ids = np.arange(count, dtype=np.int32).reshape(grid.shape)
+    forward, backward = np.empty((3, count), np.int32), np.empty((3, count), np.int32)
+    for axis in range(3):
+        rows = np.arange(grid.shape[axis])
+        forward[axis] = ids.take(np.minimum(rows + 1, rows[-1]), axis).reshape(-1)
+        backward[axis] = ids.take(np.maximum(rows - 1, 0), axis).reshape(-1)
+    return Band(
+        grid=grid,
+        box=tuple(slice(0, n) for n in grid.shape),
+        half_width=0.0,
+        surface=None,
+        voxel=ids.reshape(-1),
+        first=np.arange(count + 1, dtype=np.int32),
+        vertex=np.zeros(count, np.int32),
+        normal=np.zeros((3, count), np.float32),
+        distance=np.zeros(count, np.float32),
+        forward=forward,
+        backward=backward,
+    )

@@ -15,6 +15,9 @@ EXTENSIONS = ("closest-point", "pde", "none")
 
 # Trilinear weight that valid corners must hold for a value to count as known: one corner's mean share.
 LEAST_WEIGHT = 0.125
+# Voxels to either side of the surface at which data are sampled: the two samples share no corner along the normal, and
+# lie within the voxels that the surface passes through or beside.
+HALF_STEP = 0.5
 # Filling is a start for the flow, not an answer: residual at which it stops, and the most iterations it gets.
 FILL_TOLERANCE = 1e-3
 FILL_ITERATIONS = 300
@@ -64,11 +67,20 @@ def extend(band: Band, samples: np.ndarray, method: str = "closest-point") -> Ex
 
 
 def at_closest_points(band: Band, own: np.ndarray) -> np.ndarray:
-    """(E,) trilinear values of `own` (E,) at each entry's closest point; NaN where valid corners are too few."""
-    out = np.full_like(own, np.nan)
+    """(E,) values of `own` (E,) at each entry's closest point; NaN where valid corners are too few.
+
+    The mean of two trilinear samples HALF_STEP voxels on either side along the normal: exact for values linear in depth,
+    and with half the noise of one sample at the point itself.
+    """
     start = np.arange(band.entries, dtype=np.int32)
-    interpolate.linear(own, start, band.closest_offset, band.forward, band.backward, LEAST_WEIGHT, out)
-    return out
+    finest = band.grid.spacing[np.array(band.grid.shape) > 1].min()
+    aside = (HALF_STEP * finest * band.normal / band.grid.spacing[:, None]).astype(np.float32)
+    above, below = np.full_like(own, np.nan), np.full_like(own, np.nan)
+    for out, offset in ((above, band.closest_offset + aside), (below, band.closest_offset - aside)):
+        interpolate.linear(own, start, offset, band.forward, band.backward, LEAST_WEIGHT, out)
+    lone = np.where(np.isnan(above), below, above)
+    mean = (above + below) / 2
+    return np.where(np.isnan(mean), lone, mean)
 
 
 def transported(band: Band, own: np.ndarray) -> np.ndarray:

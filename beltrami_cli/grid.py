@@ -43,7 +43,7 @@ class Grid:
     @property
     def spacing(self) -> np.ndarray:
         """(3,) voxel edge lengths in mm."""
-        return np.sqrt((self.affine[:3, :3] ** 2).sum(0))
+        return np.asarray(np.linalg.norm(self.affine[:3, :3], axis=0))
 
     @property
     def handedness(self) -> int:
@@ -57,7 +57,7 @@ class Grid:
 
     def to_world(self, ijk: np.ndarray) -> np.ndarray:
         """Points (N, 3) in voxel indices to RAS mm."""
-        return ijk @ self.affine[:3, :3].T + self.affine[:3, 3]
+        return np.asarray(ijk @ self.affine[:3, :3].T + self.affine[:3, 3])
 
     def to_index(self, ras_mm: np.ndarray) -> np.ndarray:
         """Points (N, 3) in RAS mm to voxel indices."""

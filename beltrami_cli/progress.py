@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
-# Called once after every iteration with (iterations done, iterations in total, what the loop knows about the step).
-Observer = Callable[[int, int, Any], None]
+from beltrami_cli.evolve import Observer
 
 
 @contextmanager
@@ -23,7 +21,7 @@ def iteration_bar(label: str, *, quiet: bool = False) -> Iterator[Observer | Non
     # Cleared at the end: the summary that follows says the same and stays.
     with tqdm(desc=label, unit="it", leave=False, file=sys.stderr) as bar:
 
-        def observe(iteration: int, total: int, info: Any) -> None:
+        def observe(iteration: int, total: int, change: float) -> None:
             bar.total = total
             bar.update(iteration - bar.n)
 

@@ -13,30 +13,37 @@ import beltrami_cli
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-HEAVY = {"SimpleITK", "matplotlib", "meshio", "nibabel", "numba", "scipy", "skimage", "tqdm", "trimesh"}
+HEAVY = {"SimpleITK", "matplotlib", "nibabel", "numba", "scipy", "skimage", "tqdm", "trimesh"}
 
 
 def run(*arguments: str) -> str:
     return subprocess.run([sys.executable, *arguments], check=True, capture_output=True, text=True).stdout
 
 
-def imported_packages() -> set[str]:
+def imported_packages(folder: str) -> set[str]:
     names = set()
-    for file in (ROOT / "beltrami_cli").rglob("*.py"):
+    for file in (ROOT / folder).rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.Import):
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 names.add(node.module.split(".")[0])
-    return names - set(sys.stdlib_module_names) - {"beltrami_cli"}
+    own = {"beltrami_cli"} | {file.stem for file in (ROOT / folder).glob("*.py")}
+    return {{"skimage": "scikit-image"}.get(name, name) for name in names - set(sys.stdlib_module_names) - own}
+
+
+def names_of(requirements: list[str]) -> set[str]:
+    return {requirement.split(">=")[0] for requirement in requirements}
 
 
 def test_dependencies_are_what_the_package_imports():
+    optional = names_of(PROJECT["optional-dependencies"]["report"])
+    assert imported_packages("beltrami_cli") - optional == names_of(PROJECT["dependencies"])
+
+
+def test_tests_import_nothing_undeclared():
     extras = PROJECT["optional-dependencies"]
-    packages = {requirement.split(">=")[0] for requirement in PROJECT["dependencies"]}
-    imported = {{"skimage": "scikit-image"}.get(name, name) for name in imported_packages()}
-    optional = {requirement.split(">=")[0] for requirement in extras["report"]}
-    assert imported - optional == packages
+    assert imported_packages("tests") <= names_of([*PROJECT["dependencies"], *extras["report"], *extras["dev"]])
 
 
 def test_console_script_and_module_are_one_command():

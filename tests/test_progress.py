@@ -17,9 +17,9 @@ class Terminal(io.StringIO):
 def test_bar_counts_to_the_total_on_a_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     with iteration_bar("flow") as observe:
-        observe(1, 3, None)
+        observe(1, 3, 0.5)
         time.sleep(0.15)  # tqdm draws at most every 0.1 s
-        observe(3, 3, None)
+        observe(3, 3, 0.1)
         assert "flow: 100%" in sys.stderr.getvalue() and "3/3" in sys.stderr.getvalue()
 
 

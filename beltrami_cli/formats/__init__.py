@@ -211,6 +211,6 @@ def _steps(spacing: float | Sequence[float] | None) -> float | tuple[float, ...]
     if spacing is None:
         return 1.0
     steps = np.atleast_1d(np.asarray(spacing, float))
-    if len(steps) > 3 or not (np.isfinite(steps) & (steps > 0)).all():
+    if len(steps) not in (1, 2, 3) or not (np.isfinite(steps) & (steps > 0)).all():
         raise RefusedError(f"spacing {spacing}: expected one positive number of mm, or one for each axis")
     return float(steps[0]) if len(steps) == 1 else tuple(map(float, steps))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,8 +15,6 @@ from beltrami_cli.errors import BeltramiError, DataError, RefusedError
 
 # Vertices per hemisphere of the usual cortical meshes, whose data is often stored in volume files.
 _SURFACE_SIZES = {642, 2562, 10242, 40962, 163842, 32492, 59292}
-# No imaging matrix has an axis this long; vertices folded into a volume file do (fsaverage as 27307 x 1 x 6).
-_LONGEST_AXIS = 16384
 
 
 @contextmanager
@@ -28,7 +27,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
             raise
         except Exception as error:
             raise DataError(
-                f"{path}: cannot be read as {kind} ({_reason(error)}); "
+                f"{path}: cannot be read as {kind} ({_reason(error, 'damaged, cut short or of another kind')}); "
                 "expected a complete file of that format: check that it was copied or downloaded whole"
             ) from error
 
@@ -42,9 +41,8 @@ def writing(path: Path) -> Iterator[None]:
         except BeltramiError:
             raise
         except Exception as error:
-            raise DataError(
-                f"{path.name}: cannot be written ({_reason(error)}); check the disk and its quota"
-            ) from error
+            reason = _reason(error, "the folder or the disk refuses it")
+            raise DataError(f"{path.name}: cannot be written ({reason}); check the disk and its quota") from error
 
 
 def require_file(path: Path) -> None:
@@ -79,9 +77,11 @@ def spatial_shape(path: Path, file_shape: tuple[int, ...]) -> tuple[int, int, in
             f"{path}: several frames are not supported yet: found {len(file_shape)}-D ({axes}); extract one frame"
         )
     nx, ny, nz = (*file_shape, 1)[:3]
-    if sorted((nx, ny, nz))[1] == 1 or max(nx, ny, nz) > _LONGEST_AXIS:
-        size = nx * ny * nz
-        guess = f", {size} values as on a cortical mesh" if size in _SURFACE_SIZES else ""
+    on_mesh = nx * ny * nz in _SURFACE_SIZES
+    # Long rows of vertices are also stored folded (fsaverage as 27307 x 1 x 6).
+    folded = on_mesh and len(file_shape) > 2 and 1 in (nx, ny, nz)
+    if sorted((nx, ny, nz))[1] == 1 or folded:
+        guess = f", {nx * ny * nz} values as on a cortical mesh" if on_mesh else ""
         raise RefusedError(
             f"{path}: expected a volume or a plane; found {found}{guess}: data of a surface or a time course, "
             "not of voxels; give the volume instead"
@@ -106,6 +106,23 @@ def require_usable_affine(path: Path, affine: np.ndarray) -> None:
 
 
 @contextmanager
+def native_stderr_muted() -> Iterator[None]:
+    """Silence C and C++ code, which prints its complaints to the process's stderr beside the error that it raises."""
+    try:
+        saved = os.dup(2)
+    except OSError:
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+
+
+@contextmanager
 def _quietly() -> Iterator[None]:
     log = logging.getLogger("nibabel.global")
     was_disabled, log.disabled = log.disabled, True
@@ -117,10 +134,9 @@ def _quietly() -> Iterator[None]:
         log.disabled = was_disabled
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: Exception, otherwise: str) -> str:
+    """The library's own words, or `otherwise` where they mean nothing to a user."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    if "ITK ERROR" in str(error):
-        return "its content is damaged, cut short or of another kind"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__
+    return otherwise if not lines or isinstance(error, LookupError) or "ITK" in str(error) else lines[0]

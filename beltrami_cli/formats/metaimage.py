@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,7 +39,7 @@ def read(path: Path, dtype: DTypeLike) -> Volume:
 
     reader = _open(path)
     grid = _grid(path, reader)
-    with checks.reading(path, "MetaImage"), _mute_stderr():
+    with checks.reading(path, "MetaImage"), checks.native_stderr_muted():
         image = reader.Execute()
         data = sitk.GetArrayFromImage(image).T.astype(dtype, copy=False)
     entries = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys() if not key.startswith("ITK_")}
@@ -49,8 +47,11 @@ def read(path: Path, dtype: DTypeLike) -> Volume:
 
 
 def files(path: Path) -> list[Path]:
-    """What `write` makes: for .mhd the voxels before the header that announces them."""
-    return [path.with_suffix(".raw"), path] if path.suffix.lower() == ".mhd" else [path]
+    """What `write` makes: for .mhd the voxels before the header that announces them. Raises RefusedError for .MHA."""
+    if path.suffix not in (".mha", ".mhd"):
+        # ITK would write another file than the one that is named.
+        raise RefusedError(f"{path}: MetaImage is written in lower case only; expected the suffix .mha or .mhd")
+    return [path.with_suffix(".raw"), path] if path.suffix == ".mhd" else [path]
 
 
 def require_writable(path: Path, grid: Grid) -> None:
@@ -65,7 +66,7 @@ def write(path: Path, volume: Volume, dtype: DTypeLike) -> None:
 
     require_writable(path, volume.grid)
     data = np.asarray(volume.data, dtype).reshape(volume.file_shape)
-    with checks.writing(path), _mute_stderr():
+    with checks.writing(path), checks.native_stderr_muted():
         image = sitk.GetImageFromArray(data.T, isVector=False)
         direction, spacing, origin = _to_lps(volume.grid, data.ndim)
         image.SetDirection(direction.ravel().tolist())
@@ -74,7 +75,7 @@ def write(path: Path, volume: Volume, dtype: DTypeLike) -> None:
         if isinstance(volume.header, MetaHeader):
             for key, value in volume.header.entries.items():
                 image.SetMetaData(key, value)
-        sitk.WriteImage(image, os.fspath(path), useCompression=path.suffix.lower() == ".mha")
+        sitk.WriteImage(image, os.fspath(path), useCompression=path.suffix == ".mha")
 
 
 def _open(path: Path) -> Any:
@@ -84,7 +85,7 @@ def _open(path: Path) -> Any:
     reader = sitk.ImageFileReader()
     reader.SetImageIO("MetaImageIO")
     reader.SetFileName(os.fspath(path))
-    with checks.reading(path, "MetaImage"), _mute_stderr():
+    with checks.reading(path, "MetaImage"), checks.native_stderr_muted():
         reader.ReadImageInformation()
     _require_voxels(path)
     channels = reader.GetNumberOfComponents()
@@ -99,7 +100,7 @@ def _require_voxels(path: Path) -> None:
         entry = re.search(rb"^ElementDataFile\s*=\s*(.+?)\s*$", file.read(65536), re.MULTILINE)
     name = entry.group(1).decode(errors="replace") if entry else "LOCAL"
     if not name.upper().startswith(("LOCAL", "LIST")) and "%" not in name and not (path.parent / name).exists():
-        raise RefusedError(f"{path}: a header alone; expected its voxels in {name} beside it; fetch that file too")
+        raise RefusedError(f"{path}: half of a pair; expected {name} beside it; fetch that file too")
 
 
 def _grid(path: Path, reader: Any) -> Grid:
@@ -124,20 +125,3 @@ def _to_lps(grid: Grid, axes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     spacing[:used] = grid.spacing[:used]
     origin[:used] = affine[:used, 3]
     return direction, spacing, origin
-
-
-@contextmanager
-def _mute_stderr() -> Iterator[None]:
-    """The library prints its complaints straight to the process's stderr, beside the exception that it raises."""
-    try:
-        saved = os.dup(2)
-    except OSError:
-        yield
-        return
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)

@@ -22,7 +22,7 @@ class MghHeader:
 
 
 def read_grid(path: Path) -> Grid:
-    """The grid alone; no voxel is read. Raises as `read`."""
+    """The grid alone. Raises as `read`."""
     return _open(path)[1].grid
 
 
@@ -50,9 +50,11 @@ def write(path: Path, volume: Volume) -> None:
 
 def _open(path: Path) -> tuple[Any, MghHeader]:
     import nibabel as nib
+    from nibabel.openers import ImageOpener
 
-    with checks.reading(path, "MGH"):
-        image: Any = nib.MGHImage.from_filename(path, mmap=False)
+    # All at once: scan parameters stand behind the voxels, so that a reader of the file would decompress it twice.
+    with checks.reading(path, "MGH"), ImageOpener(path) as file:
+        image: Any = nib.MGHImage.from_bytes(file.read())
     shape = checks.spatial_shape(path, tuple(map(int, image.shape)))
     checks.require_real(path, image.get_data_dtype())
     affine = np.array(image.affine, float)

@@ -47,9 +47,9 @@ def read(path: Path, dtype: DTypeLike) -> Volume:
 
 def files(path: Path) -> list[Path]:
     """What `write` makes: one file, or both of a pair, the image before the header that announces it."""
-    if path.suffix.lower() in (".hdr", ".img"):
-        return [path.with_suffix(".img"), path.with_suffix(".hdr")]
-    return [path]
+    if path.suffix.lower() not in (".hdr", ".img"):
+        return [path]
+    return [path.with_suffix(part.upper() if path.suffix.isupper() else part) for part in (".img", ".hdr")]
 
 
 def write(path: Path, volume: Volume, dtype: DTypeLike) -> None:
@@ -75,6 +75,9 @@ def write(path: Path, volume: Volume, dtype: DTypeLike) -> None:
 def _open(path: Path) -> tuple[Any, NiftiHeader]:
     import nibabel as nib
 
+    for part in files(path):
+        if not part.exists():
+            raise RefusedError(f"{path}: half of a pair; expected {part.name} beside it; fetch that file too")
     with checks.reading(path, "NIfTI"):
         # Not mapped: a file that is cut short must fail here, in one line, and not at the first touch of a page.
         image: Any = nib.load(path, mmap=False)
@@ -96,11 +99,6 @@ def _require_nifti_volume(path: Path, image: Any) -> None:
     if not isinstance(image, nib.Nifti1Pair):
         raise RefusedError(
             f"{path}: expected NIfTI; found {type(image).__name__}, of uncertain orientation; convert it to NIfTI"
-        )
-    partner = Path(image.file_map["image"].filename)
-    if not partner.exists():
-        raise RefusedError(
-            f"{path}: a header alone; expected its voxels in {partner.name} beside it; fetch that file too"
         )
 
 

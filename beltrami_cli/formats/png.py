@@ -25,7 +25,7 @@ def read(path: Path, dtype: DTypeLike) -> Volume:
     """
     import SimpleITK as sitk
 
-    with checks.reading(path, "PNG"):
+    with checks.reading(path, "PNG"), checks.native_stderr_muted():
         image = sitk.ReadImage(os.fspath(path), imageIO="PNGImageIO")
     channels = image.GetNumberOfComponentsPerPixel()
     if channels != 1:

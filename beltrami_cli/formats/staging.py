@@ -74,10 +74,10 @@ class Stage:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _folder(self, parent: Path) -> Path:
-        return parent / f".{self._finals[0].name}.partial"
+        return parent.resolve() / f".{self._finals[0].name}.partial"
 
     def _folders(self) -> list[Path]:
-        return [self._folder(parent) for parent in dict.fromkeys(final.parent for final in self._finals)]
+        return list(dict.fromkeys(self._folder(final.parent) for final in self._finals))
 
 
 def _require_distinct(finals: list[Path]) -> None:

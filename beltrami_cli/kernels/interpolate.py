@@ -125,7 +125,7 @@ def cubic(u, origin, offset, forward, nodes, out):
 def linear(u, start, offset, forward, backward, least, out):
     """Trilinear u at each query from the cell's corners that links reach and whose value is not NaN, into out (Q,).
 
-    Weights are normalised; where they sum to less than `least`, out is left as it is.
+    Weights are normalised; where they sum to no more than `least`, out is left as it is.
     """
     for m in nb.prange(len(start)):
         s0, s1, s2 = int(np.floor(offset[0, m])), int(np.floor(offset[1, m])), int(np.floor(offset[2, m]))
@@ -140,5 +140,5 @@ def linear(u, start, offset, forward, backward, least, out):
             if e >= 0 and not np.isnan(u[e]):
                 total += w * u[e]
                 weight += w
-        if weight >= least:
+        if weight > least:
             out[m] = total / weight

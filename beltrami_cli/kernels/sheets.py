@@ -244,3 +244,28 @@ def mutual_links(forward, backward):
         kept_forward[e] = forward[e] if backward[forward[e]] == e else e
         kept_backward[e] = backward[e] if forward[backward[e]] == e else e
     return kept_forward, kept_backward
+
+
+@nb.njit(cache=True, parallel=True)
+def entries_at_vertices(voxel, vertex, first, shape, spacing, points, ijk):
+    """For each mesh vertex the entry of its own sheet beside it (V,), -1 where none, and the offset (3, V) from its voxel.
+
+    Of the entries in the eight voxels around, the one whose own vertex is nearest.
+    """
+    start, offset = np.full(len(ijk), -1, np.int32), np.zeros((3, len(ijk)), np.float32)
+    for v in nb.prange(len(ijk)):
+        best = LINK_VOXELS**2
+        for corner in range(8):
+            i = int(ijk[v, 0]) + (corner >> 2)
+            j = int(ijk[v, 1]) + (corner >> 1 & 1)
+            k = int(ijk[v, 2]) + (corner & 1)
+            if i >= shape[0] or j >= shape[1] or k >= shape[2]:
+                continue
+            x = (i * shape[1] + j) * shape[2] + k
+            for e in range(first[x], first[x + 1]):
+                apart = squared_voxels(points, vertex[e], v, spacing)
+                if apart < best:
+                    best = apart
+                    start[v] = e
+                    offset[0, v], offset[1, v], offset[2, v] = ijk[v, 0] - i, ijk[v, 1] - j, ijk[v, 2] - k
+    return start, offset

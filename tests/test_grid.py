@@ -1,0 +1,78 @@
+"""Grids: spacing, orientation, comparison, and the words of a refusal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from twins import SPACING_MM, TWINS, voxels
+
+from beltrami_cli.errors import RefusedError
+from beltrami_cli.grid import Grid, Volume, require_same_grid
+
+
+@pytest.mark.parametrize(
+    ("shape", "spacing", "full_shape", "steps"),
+    [
+        ((4, 5, 6), 1.0, (4, 5, 6), (1, 1, 1)),
+        ((4, 5, 6), 0.8, (4, 5, 6), (0.8, 0.8, 0.8)),
+        ((4, 5, 6), (1.0, 2.0, 3.0), (4, 5, 6), (1, 2, 3)),
+        ((4, 5), 0.5, (4, 5, 1), (0.5, 0.5, 0.5)),
+        ((4, 5), (0.5, 0.25), (4, 5, 1), (0.5, 0.25, 1)),
+        ((4, 5, 6, 1), 2.0, (4, 5, 6), (2, 2, 2)),
+    ],
+)
+def test_from_spacing(shape, spacing, full_shape, steps):
+    grid = Grid.from_spacing(shape, spacing)
+    assert grid.shape == full_shape
+    assert np.array_equal(grid.affine, np.diag([*steps, 1.0]))
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_world_and_index_are_inverse(name):
+    grid = TWINS[name]
+    ijk = voxels(grid)
+    assert np.allclose(grid.to_index(grid.to_world(ijk)), ijk, atol=1e-10)
+    assert np.allclose(grid.spacing, SPACING_MM)
+    assert not grid.is_sheared()
+
+
+def test_handedness():
+    signs = {"RAS": 1, "LAS": -1, "LPS": 1, "PSR": -1, "oblique": 1, "oblique left-handed": -1}
+    assert {name: grid.handedness for name, grid in TWINS.items()} == signs
+
+
+def test_shear_is_noticed():
+    affine = np.eye(4)
+    affine[1, 2] = 0.0646  # a gantry tilt of 3.7 degrees
+    assert Grid((3, 3, 3), affine).is_sheared()
+
+
+def test_grids_match_within_the_rounding_of_a_header():
+    grid = TWINS["oblique"]
+    assert grid.matches(Grid(grid.shape, grid.affine.astype(np.float32).astype(float)))
+    moved = grid.affine.copy()
+    moved[0, 3] += 0.01
+    assert not grid.matches(Grid(grid.shape, moved))
+    turned = grid.affine.copy()
+    turned[:3, 0] *= 1.001  # by the last voxel 0.004 mm off
+    assert not grid.matches(Grid(grid.shape, turned))
+
+
+def test_refusal_prints_both_grids():
+    with pytest.raises(RefusedError) as refusal:
+        require_same_grid(TWINS["RAS"], "psi.nii", TWINS["LAS"], "data.nii")
+    first, *grids = str(refusal.value).splitlines()
+    assert "data.nii does not lie on the grid of psi.nii" in first
+    assert "--resample" in first
+    assert grids == [f"  psi.nii: {TWINS['RAS'].describe()}", f"  data.nii: {TWINS['LAS'].describe()}"]
+    assert "5 x 7 x 6 voxels of 1 x 1.25 x 2 mm, affine [-1 0 0 13;" in grids[1]
+
+
+def test_volume_keeps_its_file_shape_and_header():
+    grid = Grid.from_spacing((2, 3))
+    volume = Volume(np.zeros((2, 3, 1), np.float32), grid, (2, 3), header="template")
+    other = volume.with_data(np.ones((2, 3, 1), np.float32))
+    assert (other.file_shape, other.header, other.data.sum()) == ((2, 3), "template", 6)
+    assert Volume(np.zeros((2, 3, 1)), grid).file_shape == (2, 3, 1)
+    with pytest.raises(ValueError, match=r"\(3, 2, 1\)"):
+        Volume(np.zeros((3, 2, 1)), grid)

@@ -1,0 +1,137 @@
+"""Outputs appear whole or not at all, in order, and never in place of an input."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.formats import Stage
+
+
+def everything_in(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def test_files_appear_together_at_commit(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    finals = [tmp_path / "o.nii.gz", tmp_path / "meshes" / "o.ply", tmp_path / "o.json"]
+    with Stage(finals) as stage:
+        for final in finals:
+            assert stage.path(final).name == final.name
+            assert stage.path(final).parent.parent == final.parent
+            stage.path(final).write_text(final.name)
+        assert not any(final.exists() for final in finals)
+        stage.commit()
+    assert everything_in(tmp_path) == {"meshes", "o.nii.gz", "meshes/o.ply", "o.json"}
+    assert [final.read_text() for final in finals] == ["o.nii.gz", "o.ply", "o.json"]
+
+
+@pytest.mark.parametrize("interruption", [ValueError, KeyboardInterrupt, SystemExit])
+def test_leaving_without_commit_leaves_nothing(tmp_path, interruption):
+    def interrupted() -> None:
+        with Stage([tmp_path / "a", tmp_path / "b"]) as stage:
+            stage.path(tmp_path / "a").write_text("half")
+            raise interruption
+
+    with pytest.raises(interruption):
+        interrupted()
+    with Stage([tmp_path / "a"]) as stage:
+        stage.path(tmp_path / "a").write_text("whole, but never committed")
+    assert everything_in(tmp_path) == set()
+
+
+def test_a_killed_run_leaves_no_output_and_the_next_one_clears_up(tmp_path):
+    final = tmp_path / "o.nii.gz"
+    program = (
+        "import os, signal, sys; from pathlib import Path; from beltrami_cli.formats import Stage\n"
+        "final = Path(sys.argv[1])\n"
+        "with Stage([final]) as stage:\n"
+        "    stage.path(final).write_text('half'); os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    killed = subprocess.run([sys.executable, "-c", program, str(final)], check=False)
+    assert killed.returncode == -9
+    assert everything_in(tmp_path) == {".o.nii.gz.partial", ".o.nii.gz.partial/o.nii.gz"}
+
+    with Stage([final]) as stage:
+        assert not stage.path(final).exists()
+        stage.path(final).write_text("whole")
+        stage.commit()
+    assert everything_in(tmp_path) == {"o.nii.gz"}
+
+
+def test_an_existing_output_needs_overwrite(tmp_path):
+    final, mark = tmp_path / "o.npy", tmp_path / "o.json"
+    mark.write_text("old")
+    with pytest.raises(RefusedError, match=r"o\.json: exists already; .*--overwrite"):
+        Stage([final, mark])
+    with Stage([final, mark], overwrite=True) as stage:
+        stage.path(final).write_text("new")
+        stage.path(mark).write_text("new")
+        assert mark.read_text() == "old"
+        stage.commit()
+    assert (final.read_text(), mark.read_text()) == ("new", "new")
+
+
+def test_the_mark_of_completion_never_stands_beside_new_files_of_an_unfinished_run(tmp_path, monkeypatch):
+    final, mark = tmp_path / "o.npy", tmp_path / "o.json"
+    final.write_text("old")
+    mark.write_text("old")
+
+    def fail(source: Path, target: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    def run() -> None:
+        with Stage([final, mark], overwrite=True) as stage:
+            stage.path(final).write_text("new")
+            stage.path(mark).write_text("new")
+            monkeypatch.setattr("os.replace", fail)
+            stage.commit()
+
+    with pytest.raises(DataError, match=r"o\.npy: cannot be put in place \(No space left on device\)"):
+        run()
+    assert everything_in(tmp_path) == {"o.npy"}
+
+
+def test_nothing_is_put_in_place_while_one_is_missing(tmp_path):
+    def run() -> None:
+        with Stage([tmp_path / "a", tmp_path / "b"]) as stage:
+            stage.path(tmp_path / "a").write_text("a")
+            stage.commit()
+
+    with pytest.raises(DataError, match="announced but not written"):
+        run()
+    assert everything_in(tmp_path) == set()
+
+
+def test_refusals_come_before_anything_is_made(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "input").write_text("data")
+    (tmp_path / "link").symlink_to(tmp_path / "input")
+    refusals = [
+        (([tmp_path / "gone" / "o.npy"],), {}, "does not exist"),
+        (([tmp_path / "folder"],), {"overwrite": True}, "is a folder"),
+        (([tmp_path / "o", tmp_path / "folder" / ".." / "o"],), {}, "named for two outputs"),
+        (([tmp_path / "input"],), {"overwrite": True, "inputs": [tmp_path / "input"]}, "is an input"),
+        (([tmp_path / "link"],), {"overwrite": True, "inputs": [tmp_path / "input"]}, "is an input"),
+    ]
+    before = everything_in(tmp_path)
+    for arguments, options, words in refusals:
+        with pytest.raises(RefusedError, match=words) as refusal:
+            Stage(*arguments, **options)
+        assert "\n" not in str(refusal.value)
+    assert everything_in(tmp_path) == before
+    assert (tmp_path / "input").read_text() == "data"
+
+
+def test_one_folder_under_two_spellings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    finals = [Path("o.npy"), tmp_path / "o.json"]
+    with Stage(finals) as stage:
+        for final in finals:
+            stage.path(final).write_text("x")
+        stage.commit()
+    assert everything_in(tmp_path) == {"o.npy", "o.json"}
