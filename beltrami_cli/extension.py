@@ -43,8 +43,7 @@ def extend(band: Band, samples: np.ndarray, method: str = "closest-point") -> Ex
     nearest take the closest point's). Holes are then filled from the band around them.
     Raises DataError where no entry is reached by valid data.
     """
-    own = np.full_like(samples, np.nan)
-    own[band.primary] = samples[band.primary]
+    own = own_samples(band, samples)
     if band.surface is None:
         values = own
     elif method == "pde":
@@ -64,6 +63,13 @@ def extend(band: Band, samples: np.ndarray, method: str = "closest-point") -> Ex
     if not known.all():
         fill(band, values, known)
     return Extended(values, known)
+
+
+def own_samples(band: Band, samples: np.ndarray) -> np.ndarray:
+    """(E,) samples at the entries that a voxel's data belong to, NaN at those of the banks behind the nearest."""
+    own = np.full_like(samples, np.nan)
+    own[band.primary] = samples[band.primary]
+    return own
 
 
 def at_closest_points(band: Band, own: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from beltrami_cli.band import Band, build_band, flat_band
 from beltrami_cli.config import Job, Settings, parse_beta
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.evolve import Evolution, Observer, Schedule, evolve
-from beltrami_cli.extension import Reextension, extend
+from beltrami_cli.extension import Reextension, extend, own_samples
 from beltrami_cli.flows import DT_SHARE, Flow, stability_bound, typical_slope
 from beltrami_cli.grid import Grid, Volume, require_same_grid
 from beltrami_cli.progress import Phases
@@ -120,6 +120,41 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
         stage.path(files.sidecar).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
         stage.commit()
     return replace(solved, record=record)
+
+
+def run_mesh(
+    levelset: Path,
+    data: Path | None,
+    output: Path,
+    *,
+    spacing: tuple[float, ...] | None = None,
+    bring: bool = False,
+    inside: str = "negative",
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write the surface of a level set, with the data as they are at its vertices (NaN where missing).
+
+    bring: resample the data onto the level set's grid. Returns the files written; raises as `run`.
+    """
+    sources = [path for path in (levelset, data) if path is not None]
+    grids = [formats.read_grid(path, spacing=_spacing_for(path, spacing)) for path in sources]
+    if data is not None and not bring:
+        require_same_grid(grids[0], f"LEVELSET {levelset}", grids[1], f"DATA {data}")
+    _require_usable(grids[0], str(levelset))
+    files = formats.mesh_files(output, values=data is not None, curve=1 in grids[0].shape)
+    with formats.Stage(files, overwrite=overwrite, inputs=sources) as stage:
+        psi = formats.read_volume(levelset, spacing=_spacing_for(levelset, spacing))
+        plane, settings = _PlaneLast(psi.grid), Settings(inside=inside)
+        band = _band(psi.data, settings, plane, _Warnings(None))
+        values = None
+        if data is not None:
+            volume = formats.read_volume(data, spacing=_spacing_for(data, spacing))
+            if bring:
+                volume = resample(volume, psi.grid)
+            values = own_samples(band, band.gather(plane.forth(volume.data)))
+        formats.write_mesh(stage.path(output), surface_mesh(band, values))
+        stage.commit()
+    return files
 
 
 class _Files:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import meshio
 import nibabel as nib
 import numpy as np
 import pytest
@@ -20,25 +21,6 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32)
 VALUES = np.array([0.0, 1.5, np.nan, 3.0], np.float32)
 SURFACE = Mesh(VERTICES, FACES, VALUES)
 CURVE = Mesh(VERTICES, np.array([[0, 1], [1, 2], [2, 3]], np.int32), VALUES)
-
-
-def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and cells of a binary PLY, by its own header."""
-    header, body = path.read_bytes().split(b"end_header\n", 1)
-    codes = {"float": "<f4", "uchar": "u1", "int": "<i4"}
-    tables: list[tuple[int, list[tuple[str, str]]]] = []
-    for words in (line.split() for line in header.decode().splitlines()):
-        if words[0] == "element":
-            tables.append((int(words[2]), []))
-        elif words[:2] == ["property", "list"]:
-            tables[-1][1].extend([("count", "u1"), ("a", "<i4"), ("b", "<i4"), ("c", "<i4")])
-        elif words[0] == "property":
-            tables[-1][1].append((words[2], codes[words[1]]))
-    (vertex_count, vertex_fields), (cell_count, cell_fields) = tables
-    vertices = np.frombuffer(body, vertex_fields, vertex_count)
-    cells = np.frombuffer(body, cell_fields, cell_count, vertices.nbytes)
-    assert len(body) == vertices.nbytes + cells.nbytes
-    return vertices, cells
 
 
 def test_gifti(tmp_path):
@@ -68,12 +50,7 @@ def test_gifti_without_values_is_one_file(tmp_path):
 def test_ply(tmp_path):
     path = tmp_path / "m.ply"
     assert write_mesh(path, SURFACE) == [path]
-    vertices, faces = read_ply(path)
-    assert np.array_equal(np.column_stack([vertices[axis] for axis in "xyz"]), VERTICES)
-    assert np.array_equal(vertices["value"], VALUES, equal_nan=True)
-    colours = np.column_stack([vertices[name] for name in ("red", "green", "blue")])
-    assert np.array_equal(colours, rgb(VALUES))
-    assert np.array_equal(np.column_stack([faces[corner] for corner in "abc"]), FACES)
+    assert path.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
 
     mesh = trimesh.load(path, process=False)
     assert np.array_equal(mesh.vertices, VERTICES)
@@ -81,33 +58,43 @@ def test_ply(tmp_path):
     assert np.array_equal(mesh.visual.vertex_colors[:, :3], rgb(VALUES))
     assert mesh.volume == pytest.approx(2.5 * 3 * 4 / 6)  # positive: the faces look outward
 
+    twin = meshio.read(path)
+    assert np.array_equal(twin.points, VERTICES)
+    assert np.array_equal(twin.cells_dict["triangle"], FACES)
+    assert twin.point_data["value"].dtype == np.float32
+    assert np.array_equal(twin.point_data["value"], VALUES, equal_nan=True)
 
-def test_ply_of_a_curve_and_of_a_bare_shape(tmp_path):
-    write_mesh(tmp_path / "curve.ply", CURVE)
-    vertices, edges = read_ply(tmp_path / "curve.ply")
-    assert np.array_equal(vertices["value"], VALUES, equal_nan=True)
-    assert np.array_equal(np.column_stack([edges["vertex1"], edges["vertex2"]]), CURVE.cells)
+
+def test_ply_of_a_bare_shape(tmp_path):
     write_mesh(tmp_path / "bare.ply", Mesh(VERTICES, FACES))
-    assert read_ply(tmp_path / "bare.ply")[0].dtype.names == ("x", "y", "z")
+    bare = meshio.read(tmp_path / "bare.ply")
+    assert np.array_equal(bare.points, VERTICES)
+    assert bare.point_data == {}
 
 
-@pytest.mark.parametrize(("mesh", "section"), [(SURFACE, "POLYGONS 4 16"), (CURVE, "LINES 3 9")])
-def test_vtk(tmp_path, mesh, section):
+def test_ply_of_a_curve(tmp_path):
+    write_mesh(tmp_path / "curve.ply", CURVE)
+    header, body = (tmp_path / "curve.ply").read_bytes().split(b"end_header\n", 1)
+    assert b"element edge 3\nproperty int vertex1\nproperty int vertex2\n" in header
+    edges = np.frombuffer(body[-CURVE.cells.nbytes :], "<i4").reshape(-1, 2)
+    assert np.array_equal(edges, CURVE.cells)
+
+    points = trimesh.load(tmp_path / "curve.ply", process=False)
+    assert np.array_equal(points.vertices, VERTICES)
+    vertices = points.metadata["_ply_raw"]["vertex"]["data"]
+    assert np.array_equal(vertices["value"].reshape(-1), VALUES, equal_nan=True)
+    assert np.array_equal(np.column_stack([vertices[c] for c in ("red", "green", "blue")]), rgb(VALUES))
+
+
+@pytest.mark.parametrize(("mesh", "cell_type"), [(SURFACE, "triangle"), (CURVE, "line")])
+def test_vtk(tmp_path, mesh, cell_type):
     write_mesh(tmp_path / "m.vtk", mesh)
-    content = (tmp_path / "m.vtk").read_bytes()
-    assert content.startswith(b"# vtk DataFile Version 3.0\n")
-    assert content.splitlines()[2:4] == [b"BINARY", b"DATASET POLYDATA"]
-
-    def after(title: str, dtype: str, count: int) -> np.ndarray:
-        return np.frombuffer(content, dtype, count, content.index(title.encode() + b"\n") + len(title) + 1)
-
-    assert np.array_equal(after("POINTS 4 float", ">f4", 12).reshape(4, 3), VERTICES)
-    corners = mesh.cells.shape[1]
-    cells = after(section, ">i4", len(mesh.cells) * (corners + 1)).reshape(-1, corners + 1)
-    assert (cells[:, 0] == corners).all()
-    assert np.array_equal(cells[:, 1:], mesh.cells)
-    assert b"POINT_DATA 4\nSCALARS value float 1\n" in content
-    assert np.array_equal(after("LOOKUP_TABLE default", ">f4", 4), VALUES, equal_nan=True)
+    assert (tmp_path / "m.vtk").read_bytes().splitlines()[2] == b"BINARY"
+    read = meshio.read(tmp_path / "m.vtk")
+    assert read.points.dtype.itemsize == read.point_data["value"].dtype.itemsize == 4
+    assert np.array_equal(read.points, VERTICES)
+    assert np.array_equal(read.cells_dict[cell_type], mesh.cells)
+    assert np.array_equal(read.point_data["value"], VALUES, equal_nan=True)
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])

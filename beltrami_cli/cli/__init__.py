@@ -1,0 +1,54 @@
+"""The console command `beltrami`: one thin file per subcommand; heavy packages are imported inside them."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import Any
+
+import click
+
+from beltrami_cli import __version__
+from beltrami_cli.cli.common import INTERRUPTED, TERMINATED, report_error
+from beltrami_cli.cli.compare import compare
+from beltrami_cli.cli.demo import demo
+from beltrami_cli.cli.denoise import denoise
+from beltrami_cli.cli.info import info
+from beltrami_cli.cli.mesh import mesh
+from beltrami_cli.cli.phantom import phantom
+
+EPILOG = """Exit codes: 0 done; 1 the data or the numerics failed, or a comparison is out of tolerance; 2 usage, or refused
+before starting; 130 on Ctrl-C; 143 on SIGTERM.
+
+Shell completion: eval "$(_BELTRAMI_COMPLETE=bash_source beltrami)" (or zsh_source, fish_source)."""
+
+
+@click.group(epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, prog_name="beltrami")
+def beltrami() -> None:
+    """Denoise data that lie on a surface given as the zero level of a volume, above all maps on the folded cortex."""
+
+
+for command in (denoise, mesh, phantom, compare, info, demo):
+    beltrami.add_command(command)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command line and return its exit code; every failure is one line on stderr."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        code = beltrami.main(args, prog_name="beltrami", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("beltrami: interrupted; nothing was written", err=True)
+        return INTERRUPTED
+    except Exception as error:
+        # Only what a command could not report itself, before its options were read.
+        return report_error(error, verbose=False)
+    return code if isinstance(code, int) else 0
+
+
+def _terminate(_signal: int, _frame: Any) -> None:
+    sys.exit(TERMINATED)

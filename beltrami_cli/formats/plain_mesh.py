@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,70 +11,76 @@ from beltrami_cli.surface import Mesh
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
-    """Binary PLY: vertices with RGB and a float property `value`; faces, or edges for a curve."""
-    vertex_fields: list[Any] = [("xyz", "<f4", 3)]
-    properties = ["property float x", "property float y", "property float z"]
-    if mesh.values is not None:
-        vertex_fields += [("rgb", "u1", 3), ("value", "<f4")]
-        properties += ["property uchar red", "property uchar green", "property uchar blue", "property float value"]
-    vertices = np.empty(len(mesh.vertices_ras_mm), vertex_fields)
-    vertices["xyz"] = mesh.vertices_ras_mm
-    if mesh.values is not None:
-        vertices["rgb"], vertices["value"] = colours.rgb(mesh.values), mesh.values
-
-    corners = mesh.cells.shape[1]
-    if corners == 3:
-        cells = np.empty(len(mesh.cells), [("count", "u1"), ("corners", "<i4", 3)])
-        cells["count"], cells["corners"] = 3, mesh.cells
-        element = [f"element face {len(cells)}", "property list uchar int vertex_indices"]
+    """Binary PLY with colours and the float property `value` at the vertices: faces, or edges for a curve."""
+    if mesh.cells.shape[1] == 3:
+        write_with_trimesh(path, mesh)
     else:
-        cells = mesh.cells.astype("<i4")
-        element = [f"element edge {len(cells)}", "property int vertex1", "property int vertex2"]
-    lines = ["ply", "format binary_little_endian 1.0", "comment vertices in RAS mm", f"element vertex {len(vertices)}"]
-    header = "\n".join([*lines, *properties, *element, "end_header\n"])
-    _write_bytes(path, header.encode(), vertices.tobytes(), cells.tobytes())
-
-
-def write_vtk(path: Path, mesh: Mesh) -> None:
-    """Legacy binary VTK poly data, big-endian as that demands: triangles or lines, and the values at the points."""
-    count, corners = mesh.cells.shape
-    cells = np.column_stack([np.full(count, corners), mesh.cells])
-    parts = [
-        b"# vtk DataFile Version 3.0\nvertices in RAS mm\nBINARY\nDATASET POLYDATA\n",
-        f"POINTS {len(mesh.vertices_ras_mm)} float\n".encode(),
-        mesh.vertices_ras_mm.astype(">f4").tobytes(),
-        f"\n{'POLYGONS' if corners == 3 else 'LINES'} {count} {cells.size}\n".encode(),
-        cells.astype(">i4").tobytes(),
-    ]
-    if mesh.values is not None:
-        parts += [
-            f"\nPOINT_DATA {len(mesh.values)}\nSCALARS value float 1\nLOOKUP_TABLE default\n".encode(),
-            mesh.values.astype(">f4").tobytes(),
-        ]
-    _write_bytes(path, *parts, b"\n")
+        _write_ply_edges(path, mesh)
 
 
 def write_with_trimesh(path: Path, mesh: Mesh) -> None:
-    """.obj and .glb with the values as RGB at the vertices, .stl with the geometry alone; vertex order as given."""
+    """Triangles, vertices and faces in the order given.
+
+    .ply, binary, with RGBA and the float property `value` at the vertices; .obj and .glb with the values as colours;
+    .stl with the geometry alone.
+    """
     import trimesh
 
+    kind = path.suffix.lower().lstrip(".")
+    colour, numbers = None, None
+    if mesh.values is not None:
+        colour = colours.rgb(mesh.values)
+        numbers = {"value": mesh.values.astype(np.float32)} if kind == "ply" else None
     with checks.writing(path):
-        rgb = None if mesh.values is None else colours.rgb(mesh.values)
-        surface = trimesh.Trimesh(mesh.vertices_ras_mm, mesh.cells, vertex_colors=rgb, process=False)
-        surface.export(path, file_type=path.suffix.lower().lstrip("."))
+        trimesh.Trimesh(
+            mesh.vertices_ras_mm, mesh.cells, vertex_colors=colour, vertex_attributes=numbers, process=False
+        ).export(path, file_type=kind)
+
+
+def write_vtk(path: Path, mesh: Mesh) -> None:
+    """Legacy binary VTK, float32: triangles or lines, and the array `value` at the points."""
+    import meshio
+
+    cell_type = "triangle" if mesh.cells.shape[1] == 3 else "line"
+    values = {} if mesh.values is None else {"value": mesh.values.astype(np.float32)}
+    content = meshio.Mesh(mesh.vertices_ras_mm.astype(np.float32), [(cell_type, mesh.cells)], values)
+    with checks.writing(path):
+        content.write(path, file_format="vtk42")  # unlike version 5, every reader of VTK knows it
 
 
 def write_obj_lines(path: Path, mesh: Mesh) -> None:
-    """A curve as OBJ line elements, with the values as RGB at the vertices."""
+    """A curve as OBJ line elements, with the values as RGB at the vertices: by hand, no library writes them."""
     vertices = [f"v {x:.8g} {y:.8g} {z:.8g}" for x, y, z in mesh.vertices_ras_mm]
     if mesh.values is not None:
         tints = colours.rgb(mesh.values) / 255
         vertices = [f"{line} {r:.4f} {g:.4f} {b:.4f}" for line, (r, g, b) in zip(vertices, tints, strict=True)]
     lines = [f"l {a} {b}" for a, b in mesh.cells + 1]
-    _write_bytes(path, "\n".join(["# vertices in RAS mm", *vertices, *lines, ""]).encode())
+    with checks.writing(path):
+        path.write_text("\n".join(["# vertices in RAS mm", *vertices, *lines, ""]), encoding="ascii", newline="\n")
 
 
-def _write_bytes(path: Path, *parts: bytes) -> None:
-    with checks.writing(path), path.open("wb") as file:
-        for part in parts:
-            file.write(part)
+def _write_ply_edges(path: Path, mesh: Mesh) -> None:
+    """By hand: trimesh writes a path's edges without colours and values, meshio as faces of two corners."""
+    table: list[tuple[str, str, str, np.ndarray]] = [
+        (axis, "float", "<f4", mesh.vertices_ras_mm[:, k]) for k, axis in enumerate("xyz")
+    ]
+    if mesh.values is not None:
+        tints = colours.rgb(mesh.values)
+        table += [(name, "uchar", "u1", tints[:, k]) for k, name in enumerate(("red", "green", "blue"))]
+        table.append(("value", "float", "<f4", mesh.values))
+    vertices = np.empty(len(mesh.vertices_ras_mm), [(name, code) for name, _, code, _ in table])
+    for name, _, _, column in table:
+        vertices[name] = column
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment vertices in RAS mm",
+        f"element vertex {len(vertices)}",
+        *(f"property {kind} {name}" for name, kind, _, _ in table),
+        f"element edge {len(mesh.cells)}",
+        "property int vertex1",
+        "property int vertex2",
+        "end_header\n",
+    ]
+    with checks.writing(path):
+        path.write_bytes("\n".join(header).encode() + vertices.tobytes() + mesh.cells.astype("<i4").tobytes())

@@ -1,0 +1,14 @@
+"""Numba functions on flat arrays and floats; compiled on first use and cached on disk."""
+
+from pathlib import Path
+
+# What LLVM may assume: sums reordered, products fused, but NaN and infinity kept, for they mean "missing" here.
+FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
+
+
+def are_cached() -> bool:
+    """False before the first-ever use, when compiling takes about half a minute."""
+    from beltrami_cli.kernels import steps
+
+    folder = Path(steps.symmetric.stats.cache_path)
+    return any(folder.glob("steps.symmetric-*.nbi"))

@@ -7,6 +7,8 @@ A query is a start entry and an offset from its voxel, in voxels; a stencil span
 import numba as nb
 import numpy as np
 
+from beltrami_cli.kernels import FAST
+
 
 @nb.njit(cache=True)
 def walk(e, s0, s1, s2, forward, backward):
@@ -85,11 +87,11 @@ def cubic_weights(t, nodes, w):
     w[3] = (t + 1) * t * (t - 1) / 6
 
 
-@nb.njit(cache=True, parallel=True, fastmath=True)
+@nb.njit(cache=True, parallel=True, fastmath=FAST)
 def cubic(u, origin, offset, forward, nodes, out):
     """Local cubic of u at each query, within the range of the cell's own nodes, into out (Q,).
 
-    `origin` and `offset` as for `stencil_origins`; where the stencil is incomplete (-1), out is left as it is.
+    `origin` and `offset` as for `stencil_origins`. Where the stencil is incomplete (-1) or holds a NaN, out is left as it is.
     """
     f0, f1, f2 = forward[0], forward[1], forward[2]
     queries = len(origin)
@@ -118,7 +120,8 @@ def cubic(u, origin, offset, forward, nodes, out):
                     total += w0[a] * w1[b] * row
                     y = f1[y]
                 x = f0[x]
-            out[m] = min(max(total, low), high)
+            if not np.isnan(total):
+                out[m] = min(max(total, low), high)
 
 
 @nb.njit(cache=True, parallel=True)

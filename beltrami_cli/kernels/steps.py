@@ -7,6 +7,8 @@ pointing to the entry itself. Work is cut in blocks of fixed size, so sums do no
 import numba as nb
 import numpy as np
 
+from beltrami_cli.kernels import FAST
+
 BLOCK = 4096  # entries: a block's arrays stay in a core's cache
 
 # Laws of the diffusivity c as a function of b = beta^2 |v|^2, with r = 1 / sqrt(1 + b).
@@ -14,7 +16,7 @@ ONE, R, R2, R4, WEICKERT = 0, 1, 2, 3, 4
 WEICKERT_CONSTANT = 3.31488  # makes the flux c |v| rise up to |v| = 1 / beta and fall beyond
 
 
-@nb.njit(cache=True, inline="always", fastmath=True)
+@nb.njit(cache=True, inline="always", fastmath=FAST)
 def diffusivity(law, b):
     """c(b) for one of the laws above; b = beta^2 |v|^2, dimensionless; in (0, 1]."""
     if law == 0:
@@ -29,7 +31,7 @@ def diffusivity(law, b):
     return 1 - np.exp(-WEICKERT_CONSTANT / b4) if b4 > 1e-30 else b * 0 + 1
 
 
-@nb.njit(cache=True, parallel=True, fastmath=True)
+@nb.njit(cache=True, parallel=True, fastmath=FAST)
 def symmetric(u, normal, forward, backward, spacing, law, outer, beta, dt, work, out):
     """The symmetric finite-volume scheme: out = u + dt a Div(c v), second order with re-extension.
 
@@ -88,7 +90,7 @@ def symmetric(u, normal, forward, backward, spacing, law, outer, beta, dt, work,
     return changes.sum(), 0.5 * energies.sum()
 
 
-@nb.njit(cache=True, parallel=True, fastmath=True)
+@nb.njit(cache=True, parallel=True, fastmath=FAST)
 def paper(u, normal, forward, backward, spacing, law, outer, beta, dt, work, out):
     """The paper's scheme (Sec. 4.1) with |N| = 1: forward gradient, backward divergence; first order.
 

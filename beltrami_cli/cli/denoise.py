@@ -1,0 +1,142 @@
+"""beltrami denoise: the main job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from beltrami_cli.cli.common import Command, announce_compilation, note, overwrite_option, say
+
+FILE = click.Path(path_type=Path)
+
+
+@click.command(cls=Command)
+@click.argument("inputs", nargs=-1, type=FILE, metavar="LEVELSET DATA")
+@click.option("-o", "--output", "volume", type=FILE, metavar="OUT", help="The denoised volume (.nii.gz .mha .npy .mgz).")
+@click.option(
+    "--mesh", type=FILE, multiple=True, help="The surface with the denoised values; may be repeated. Default: beside OUT."
+)
+@click.option("--no-mesh", is_flag=True, default=None, help="Write no mesh.")
+@click.option("--config", type=FILE, help="A TOML file with any of this; the command line overrides it.")
+@overwrite_option
+@click.option("--flow", type=click.Choice(["beltrami", "l2", "l1", "tv", "phi"]), help="Default: beltrami.")
+@click.option(
+    "--phi",
+    type=click.Choice(["charbonnier", "perona-malik", "geman-mcclure", "weickert"]),
+    help="The function of the flow phi. Default: perona-malik.",
+)
+@click.option(
+    "--beta",
+    metavar="B|A:B[:LAW]|B1,B2,..|auto",
+    help="Keeps edges steeper than 1/beta (beta in mm per data unit): a number, a run from A to B (linear or geometric), "
+    "equal stretches of several, or auto: 1 / the data's median slope, noise included. Default: auto.",
+)
+@click.option("--eps", type=float, help="Slope (data units per mm) under which l1 and tv smooth. Default: a tenth of median.")
+@click.option(
+    "--scheme",
+    type=click.Choice(["symmetric", "paper"]),
+    help="symmetric: second order (default). paper: Sec. 4.1, first order; with unit normals and beta |N|^2 as in "
+    "Eq. 20, for the printed weights |N| blow up inside thin sulci.",
+)
+@click.option("--flat", is_flag=True, default=None, help="No surface: the flow of Eqs. 10-11; LEVELSET is omitted.")
+@click.option("--iterations", type=int, help="How many steps. Default: 20.")
+@click.option("--time", type=float, help="How long to flow, in mm^2, in place of --iterations.")
+@click.option("--fwhm", type=float, help="The same as the FWHM in mm of the Gaussian that l2 would equal.")
+@click.option("--dt", metavar="DT|auto", help="Time step in mm^2. Default: 0.9 of the stability bound.")
+@click.option(
+    "--extension",
+    type=click.Choice(["closest-point", "pde", "none"]),
+    help="How data are carried off the surface. Default: closest-point.",
+)
+@click.option("--extend-every", type=int, metavar="K", help="Steps between re-extensions, 0 for never. Default: 5.")
+@click.option("--band", type=float, metavar="MM", help="Half-width of the band. Default: 4 voxels of the largest spacing.")
+@click.option("--spacing", metavar="S|SX,SY,SZ", help="Voxel size in mm of .npy inputs. Default: 1.")
+@click.option("--resample", is_flag=True, default=None, help="Bring DATA onto LEVELSET's grid (trilinear).")
+@click.option("--inside", type=click.Choice(["negative", "positive"]), help="Psi's sign inside. Default: negative.")
+@click.option(
+    "--outside", type=click.Choice(["nan", "zero", "keep"]), help="What OUT holds beyond the band. Default: nan."
+)
+@click.option("--precision", type=click.Choice(["float32", "float64"]), help="Of computation and OUT. Default: float32.")
+@click.option("--threads", type=int, help="Default: the CPUs that the process may use.")
+def denoise(inputs: tuple[Path, ...], config: Path | None, quiet: bool, verbose: int, **options: Any) -> int:
+    """Denoise DATA along the surface where LEVELSET is zero, keeping edges.
+
+    Both are volumes on one grid (.nii .nii.gz .hdr .mha .mhd .npy .mgz; in a plane also .png). LEVELSET is negative
+    inside; NaN in DATA is missing and gets filled. Writes OUT, a mesh with the denoised value at every vertex, and a
+    JSON record beside OUT.
+
+    \b
+        beltrami denoise psi.nii.gz map.nii.gz -o denoised.nii.gz
+    """
+    from beltrami_cli.config import make_job, overlaid, read_config
+    from beltrami_cli.pipeline import run
+    from beltrami_cli.progress import iteration_bar
+
+    given = _given(inputs, options)
+    job = make_job(overlaid(read_config(config), given) if config else given)
+    announce_compilation(quiet)
+    with iteration_bar("flow", quiet=quiet) as observer:
+        result = run(job, observer=observer, notify=lambda line: note(quiet, f"warning: {line}"))
+    if verbose:
+        _tell_details(result.record)
+    for line in summary(job.volume.parent, result.record):
+        say(quiet, line)
+    return 0
+
+
+def summary(folder: Path, record: dict[str, Any]) -> tuple[str, str]:
+    """What was written, and what was done."""
+    names = [str(folder / name) for name in record["Outputs"]]
+    removed = record["Removed"]["rms"]
+    amount = "no noise measured" if removed is None else f"noise removed {removed:.4g} rms"
+    seconds = sum(record["Seconds"].values())
+    reason = f"stopped by {record['StopReason']}"
+    return f"wrote {', '.join(names)}", f"{amount}, {record['Iterations']} iterations, {reason}, {seconds:.1f} s"
+
+
+def _given(inputs: tuple[Path, ...], options: dict[str, Any]) -> dict[str, Any]:
+    """The fields that the command line sets."""
+    from beltrami_cli.config import parse_beta, parse_spacing
+
+    if len(inputs) > 2:
+        extra = " ".join(map(str, inputs[2:]))
+        raise click.UsageError(f"found {extra} after LEVELSET and DATA; expected two files")
+    given = {name: value for name, value in options.items() if value is not None and value != ()}
+    given.update(zip(("data", "levelset"), reversed(inputs), strict=False))
+    if given.pop("no_mesh", False):
+        if "mesh" in given:
+            raise click.UsageError("--mesh and --no-mesh contradict each other; give one of them")
+        given["mesh"] = ()
+    if "beta" in given:
+        given["beta"] = parse_beta(given["beta"])
+    if "spacing" in given:
+        given["spacing"] = parse_spacing(given["spacing"])
+    if "dt" in given:
+        given["dt"] = None if given["dt"] == "auto" else _number("--dt", given["dt"])
+    return given
+
+
+def _number(option: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise click.UsageError(f"{option}: found {text!r}; expected a number of mm^2, or auto") from None
+
+
+def _tell_details(record: dict[str, Any]) -> None:
+    band, each = record["Band"], record["PerIteration"]
+    note(
+        False,
+        f"band: {band['entries']} entries in {band['voxels']} voxels within {band['half_width_mm']:g} mm of "
+        f"{band['surface_vertices']} vertices; {band['filled_voxels']} voxels filled",
+    )
+    if each["beta"]:
+        note(
+            False,
+            f"flow: dt {each['dt'][0]:.5g} mm^2, beta {each['beta'][0]:.5g} to {each['beta'][-1]:.5g}, typical slope of "
+            f"the data {record['TypicalSlope']:.5g} per mm",
+        )
+    phases = ", ".join(f"{name} {seconds:.2f}" for name, seconds in record["Seconds"].items())
+    note(False, f"seconds: {phases}; peak memory {record['PeakMemoryMiB']} MiB")

@@ -1,0 +1,51 @@
+"""beltrami mesh: the surface of a level set as a mesh, with values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from beltrami_cli.cli.common import Command, announce_compilation, overwrite_option, say
+
+FILE = click.Path(path_type=Path)
+
+
+@click.command(cls=Command)
+@click.argument("levelset", type=FILE)
+@click.argument("data", type=FILE, required=False)
+@click.option("-o", "--output", type=FILE, required=True, metavar="FILE", help=".surf.gii .ply .obj .stl .glb .vtk")
+@click.option("--spacing", metavar="S|SX,SY,SZ", help="Voxel size in mm of .npy inputs. Default: 1.")
+@click.option("--resample", is_flag=True, help="Bring DATA onto LEVELSET's grid (trilinear).")
+@click.option("--inside", type=click.Choice(["negative", "positive"]), default="negative", show_default=True)
+@overwrite_option
+def mesh(
+    levelset: Path,
+    data: Path | None,
+    output: Path,
+    spacing: str | None,
+    resample: bool,
+    inside: str,
+    overwrite: bool | None,
+    quiet: bool,
+    verbose: int,
+) -> int:
+    """Write the surface where LEVELSET is zero as a mesh in RAS mm, with the values of DATA at its vertices.
+
+    A vertex beside which DATA has no value gets NaN. GIFTI writes the values to .func.gii beside the .surf.gii.
+    """
+    from beltrami_cli.config import parse_spacing
+    from beltrami_cli.pipeline import run_mesh
+
+    announce_compilation(quiet)
+    written = run_mesh(
+        levelset,
+        data,
+        output,
+        spacing=parse_spacing(spacing) if spacing else None,
+        bring=resample,
+        inside=inside,
+        overwrite=bool(overwrite),
+    )
+    say(quiet, f"wrote {', '.join(map(str, written))}")
+    return 0

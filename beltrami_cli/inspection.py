@@ -1,0 +1,78 @@
+"""Looking at volumes: how two differ, what one holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from beltrami_cli import formats
+from beltrami_cli.band import build_band
+from beltrami_cli.errors import BeltramiError, RefusedError
+from beltrami_cli.grid import require_same_grid
+from beltrami_cli.levelset import crossing_box
+from beltrami_cli.metrics import Difference, difference
+
+
+def compare_volumes(
+    a: Path,
+    b: Path,
+    *,
+    levelset: Path | None = None,
+    within: float | None = None,
+    period: float | None = None,
+    data_range: float | None = None,
+) -> Difference:
+    """B minus the reference A on one grid, near the surface of `levelset` where it is given (within mm of it).
+
+    Raises RefusedError where the grids differ, DataError where nothing can be compared.
+    """
+    first, second = formats.read_volume(a, dtype=np.float64), formats.read_volume(b, dtype=np.float64)
+    require_same_grid(first.grid, f"A {a}", second.grid, f"B {b}")
+    mask = None
+    if levelset is not None:
+        psi = formats.read_volume(levelset)
+        require_same_grid(first.grid, f"A {a}", psi.grid, f"PSI {levelset}")
+        if within is not None and not 0 < within < np.inf:
+            raise RefusedError(f"within: found {within:g}; expected a distance above 0 mm")
+        reach = 0.5 * float(psi.grid.spacing.max()) if within is None else within
+        band = build_band(psi.data, psi.grid, reach)
+        mask = np.nan_to_num(band.scatter(np.ones(band.entries, np.float32), 0.0)) > 0
+    return difference(first.data, second.data, mask=mask, period=period, data_range=data_range)
+
+
+def describe_volume(path: Path) -> list[str]:
+    """Lines on format, grid, orientation, values and surface of a volume; raises as `formats.read_volume`."""
+    volume = formats.read_volume(path)
+    grid, values = volume.grid, volume.data
+    finite = values[np.isfinite(values)]
+    shape = " x ".join(map(str, volume.file_shape))
+    lines = [
+        f"{formats.volume_format(path)}, {shape} voxels of {' x '.join(f'{h:.4g}' for h in grid.spacing)} mm, "
+        f"axes towards {_orientation(grid.affine)}{', sheared' if grid.is_sheared() else ''}",
+        f"first voxel at RAS {', '.join(f'{x:.4g}' for x in grid.affine[:3, 3])} mm",
+        f"values: {finite.size} finite, {int(np.isnan(values).sum())} NaN, {int(np.isinf(values).sum())} infinite",
+    ]
+    if finite.size:
+        low, middle, high = finite.min(), np.median(finite), finite.max()
+        lines.append(f"range: {low:.6g} to {high:.6g}, median {middle:.6g}")
+        lines.append(f"as a level set: {_as_levelset(values, finite)}")
+    return lines
+
+
+def _as_levelset(values: np.ndarray, finite: np.ndarray) -> str:
+    low, high = finite.min(), finite.max()
+    if low < high and np.all((finite == low) | (finite == high)):
+        return f"a mask of {low:g} and {high:g}: its surface would be a staircase"
+    try:
+        box = crossing_box(values, (0, 0, 0))
+    except BeltramiError:
+        return "no zero level (expected values of both signs)"
+    extent = " x ".join(f"{part.start}..{part.stop - 1}" for part in box)
+    return f"zero level within voxels {extent}; {100 * np.mean(finite < 0):.1f} % of the values are negative (inside)"
+
+
+def _orientation(affine: np.ndarray) -> str:
+    from nibabel.orientations import aff2axcodes
+
+    return "".join(str(code) for code in aff2axcodes(affine))

@@ -1,0 +1,199 @@
+"""Plain NumPy twins of the kernels: dense, slow and short, so that they can be checked by reading."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise, product
+
+import numpy as np
+
+from beltrami_cli.kernels import steps
+
+# c as a function of the slope in units of the edge, s = beta |v|.
+DIFFUSIVITY = {
+    steps.ONE: lambda s: np.ones_like(s),
+    steps.R: lambda s: (1 + s**2) ** -0.5,
+    steps.R2: lambda s: (1 + s**2) ** -1.0,
+    steps.R4: lambda s: (1 + s**2) ** -2.0,
+    steps.WEICKERT: lambda s: 1 - np.exp(-3.31488 / np.maximum(s, 1e-3) ** 8),
+}
+
+
+# --- one step of a flow ---------------------------------------------------------------------------------------------
+
+
+def difference_matrices(forward, backward, spacing):
+    """(2, 3, E, E): forward and backward differences along each axis, per mm; a row of 0 where the link is missing."""
+    entries = forward.shape[1]
+    d = np.zeros((2, 3, entries, entries))
+    for a in range(3):
+        for m in range(entries):
+            for side, (low, high) in enumerate([(m, forward[a, m]), (backward[a, m], m)]):
+                d[side, a, m, high] += 1 / spacing[a]
+                d[side, a, m, low] -= 1 / spacing[a]
+    return d
+
+
+def projection(normal):
+    """(3, 3, E): P = I - n n^T."""
+    return np.eye(3)[:, :, None] - normal[:, None] * normal[None]
+
+
+def symmetric(u, normal, forward, backward, spacing, law, outer, beta, dt):
+    """One step as minus the exact gradient of the mean energy c |P g|^2 / 2 over the 8 choices of g, c held fixed.
+
+    c is taken at the central differences. Returns (u after the step, sum of squared changes, energy).
+    """
+    d = difference_matrices(forward, backward, spacing)
+    p = projection(normal)
+    central = np.einsum("abm,bmk,k->am", p, d.mean(0), u)
+    c = DIFFUSIVITY[law](beta * np.sqrt((central**2).sum(0)))
+    rate, energy = np.zeros(len(u)), 0.0
+    for sides in product((0, 1), repeat=3):
+        g = np.stack([d[side, a] for a, side in enumerate(sides)])
+        v = np.einsum("abm,bmk,k->am", p, g, u)
+        rate -= np.einsum("amk,am->k", g, c * v) / 8
+        energy += (c * v**2).sum() / 16
+    change = dt * (c if outer else 1) * rate
+    return u + change, (change**2).sum(), energy
+
+
+def symmetric_by_fluxes(u, normal, forward, backward, spacing, law, outer, beta, dt):
+    """The same step written as a finite-volume scheme: fluxes through the faces between linked entries."""
+    own = np.arange(len(u))
+    p = projection(normal)
+    h = np.asarray(spacing)[:, None]
+    g = (u[forward] - u[backward]) / (2 * h)  # a missing link adds 0 to either side
+    v = np.einsum("abm,bm->am", p, g)
+    c = DIFFUSIVITY[law](beta * np.sqrt((v**2).sum(0)))
+    rate = np.zeros(len(u))
+    for a in range(3):
+        q = c * (v[a] - p[a, a] * g[a])
+        f = forward[a]
+        flux = (c * p[a, a] + (c * p[a, a])[f]) / 2 * (u[f] - u) / h[a] + (q + q[f]) / 2
+        flux[f == own] = 0
+        rate += flux / h[a] - np.where(backward[a] == own, 0, flux[backward[a]]) / h[a]
+    return u + dt * (c if outer else 1) * rate
+
+
+def paper(u, normal, forward, backward, spacing, law, outer, beta, dt):
+    """Sec. 4.1 with |N| = 1: forward gradient and its adjoint, the backward divergence. Returns as `symmetric`."""
+    d = difference_matrices(forward, backward, spacing)[0]
+    v = np.einsum("abm,bmk,k->am", projection(normal), d, u)
+    c = DIFFUSIVITY[law](beta * np.sqrt((v**2).sum(0)))
+    change = -dt * (c if outer else 1) * np.einsum("amk,am->k", d, c * v)
+    return u + change, (change**2).sum(), (c * v**2).sum() / 2
+
+
+# --- interpolation on a sheet ---------------------------------------------------------------------------------------
+
+
+def walk(e, moves, forward, backward):
+    """The entry `moves` (3,) voxels away, one link at a time in turn along each axis that still has one; else None."""
+    left = list(moves)
+    while any(left):
+        stuck = True
+        for a in range(3):
+            table = forward if left[a] > 0 else backward
+            if left[a] and table[a, e] != e:
+                e = table[a, e]
+                left[a] -= int(np.sign(left[a]))
+                stuck = False
+        if stuck:
+            return None
+    return e
+
+
+def lagrange(t):
+    """(4,) weights at t of the cubic through the nodes -1, 0, 1, 2."""
+    x = np.arange(-1.0, 3.0)
+    return np.array([np.prod([(t - x[j]) / (x[i] - x[j]) for j in range(4) if j != i]) for i in range(4)])
+
+
+def cubic_at(volume, ijk):
+    """Local cubic of a dense volume at a point ijk (3,) in voxels, within the range of the eight nodes around it.
+
+    NaN where one of the 64 nodes is outside or NaN. An axis of length 1 takes no part.
+    """
+    low = np.floor(ijk).astype(int)
+    nodes = [np.arange(x - 1, x + 3) if n > 1 else np.array([0]) for x, n in zip(low, volume.shape, strict=True)]
+    if any(x[0] < 0 or x[-1] >= n for x, n in zip(nodes, volume.shape, strict=True)):
+        return np.nan
+    weights = [lagrange(t) if n > 1 else np.ones(1) for t, n in zip(ijk - low, volume.shape, strict=True)]
+    block = volume[np.ix_(*nodes)]
+    cell = block[tuple(slice(1, 3) if n > 1 else slice(None) for n in volume.shape)]
+    return np.clip(np.einsum("ijk,i,j,k", block, *weights), cell.min(), cell.max())
+
+
+def linear_at(u, e, offset, forward, backward, least):
+    """Trilinear mean of the corners of the cell at `offset` (3,) from entry e that are reached and known; else None."""
+    low = np.floor(offset).astype(int)
+    total = weight = 0.0
+    for corner in product((0, 1), repeat=3):
+        w = np.prod([t if k else 1 - t for t, k in zip(offset - low, corner, strict=True)])
+        reached = walk(e, low + corner, forward, backward)
+        if w > 0 and reached is not None and not np.isnan(u[reached]):
+            total += w * u[reached]
+            weight += w
+    return total / weight if weight > least else None
+
+
+# --- extension ------------------------------------------------------------------------------------------------------
+
+
+def transport(u, normal, distance, forward, backward, spacing, width, dt):
+    """One upwind step of U_t + s grad U . n = 0 with s = d / sqrt(d^2 + width^2)."""
+    out = u.copy()
+    for m in range(len(u)):
+        speed = distance[m] / np.hypot(distance[m], width) * normal[:, m] / spacing
+        upwind = [(backward if s > 0 else forward)[a, m] for a, s in enumerate(speed)]
+        known = [(abs(s), u[e]) for s, e in zip(speed, upwind, strict=True) if e != m and not np.isnan(u[e])]
+        if not np.isnan(u[m]):
+            out[m] -= dt * sum(s * (u[m] - value) for s, value in known)
+        elif sum(s for s, _ in known) > np.abs(speed).sum() / 2:
+            out[m] = sum(s * value for s, value in known) / sum(s for s, _ in known)
+    return out
+
+
+def flood(u, forward, backward):
+    """Ring by ring: every unknown entry with a known neighbour takes the mean of its known neighbours."""
+    u = u.copy()
+    while True:
+        around = np.concatenate([u[forward], u[backward]])
+        count = (~np.isnan(around)).sum(0)
+        new = np.isnan(u) & (count > 0)
+        if not new.any():
+            return u
+        u[new] = np.nansum(around, 0)[new] / count[new]
+
+
+# --- geometry -------------------------------------------------------------------------------------------------------
+
+
+def neighbours(cells) -> list[set[int]]:
+    """Vertices joined to each vertex by an edge of a triangle or segment."""
+    around: list[set[int]] = [set() for _ in range(cells.max() + 1)]
+    for cell in cells.tolist():
+        for a, b in pairwise([*cell, cell[0]]):
+            around[a].add(b)
+            around[b].add(a)
+    return around
+
+
+def closest_on_quadric(x, k1, k2):
+    """Closest point to x (3,) on z = -(k1 x^2 + k2 y^2) / 2, by Newton's method from the foot of x on the plane z = 0."""
+    k, s = np.array([k1, k2]), np.array(x[:2], float)
+    for _ in range(50):
+        gap = x[2] + (k * s**2).sum() / 2
+        gradient = s - x[:2] + gap * k * s
+        hessian = np.diag(1 + gap * k) + np.outer(k * s, k * s)
+        s = s - np.linalg.solve(hessian, gradient)
+    return np.array([*s, -(k * s**2).sum() / 2])
+
+
+def opposite_links(band) -> Iterator[np.ndarray]:
+    """For each axis (E,) bool: whether every link forward is one backward too, and the other way round."""
+    own = np.arange(band.entries)
+    for a in range(3):
+        f, b = band.forward[a], band.backward[a]
+        yield ((f == own) | (band.backward[a, f] == own)) & ((b == own) | (band.forward[a, b] == own))
