@@ -9,7 +9,7 @@ import numpy as np
 from beltrami_cli.band import Band
 from beltrami_cli.errors import DataError
 from beltrami_cli.kernels import extend as kernels
-from beltrami_cli.kernels import interpolate, steps
+from beltrami_cli.kernels import interpolate
 
 EXTENSIONS = ("closest-point", "pde", "none")
 
@@ -18,9 +18,10 @@ LEAST_WEIGHT = 0.125
 # Voxels to either side of the surface at which data are sampled: the two samples share no corner along the normal, and
 # lie within the voxels that the surface passes through or beside.
 HALF_STEP = 0.5
-# Filling is a start for the flow, not an answer: residual at which it stops, and the most iterations it gets.
+# Filling is a start for the flow: relative residual at which it stops, and the most iterations, each of which carries the
+# rim's values one voxel further in.
 FILL_TOLERANCE = 1e-3
-FILL_ITERATIONS = 300
+FILL_ITERATIONS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,34 +113,26 @@ def fill(band: Band, values: np.ndarray, known: np.ndarray) -> None:
     kernels.flood(values, band.forward, band.backward)
     free = ~known & ~np.isnan(values)
     u = np.where(np.isnan(values), 0, values).astype(np.float64)
-    minus_laplacian = _laplacian(band)
-    residual = np.where(free, -minus_laplacian(u), 0.0)
+    image = np.empty_like(u)
+
+    def apply(v: np.ndarray) -> np.ndarray:
+        kernels.minus_laplacian(v, free, band.forward, band.backward, band.grid.spacing, image)
+        return image
+
+    residual = -apply(u)
     direction, size = residual.copy(), float(residual @ residual)
-    target = FILL_TOLERANCE**2 * max(size, 1e-300)
+    target = FILL_TOLERANCE**2 * size
     for _ in range(FILL_ITERATIONS):
         if size <= target:
             break
-        image = np.where(free, minus_laplacian(direction), 0.0)
-        stride = size / float(direction @ image)
+        curved = apply(direction)
+        stride = size / float(direction @ curved)
         u += stride * direction
-        residual -= stride * image
+        residual -= stride * curved
         size, before = float(residual @ residual), size
-        direction = residual + size / before * direction
-    low, high = values[known].min(), values[known].max()
-    values[free] = np.clip(u[free], low, high)
-
-
-def _laplacian(band: Band):  # type: ignore[no-untyped-def]
-    """u (E,) float64 -> -Laplacian over links: the symmetric scheme with P = I and c = 1."""
-    flat = np.zeros((3, band.entries))
-    work, out = np.empty((7, band.entries)), np.empty(band.entries)
-    spacing = band.grid.spacing
-
-    def apply(u: np.ndarray) -> np.ndarray:
-        steps.symmetric(u, flat, band.forward, band.backward, spacing, steps.ONE, False, 0.0, 1.0, work, out)
-        return u - out
-
-    return apply
+        direction *= size / before
+        direction += residual
+    values[free] = np.clip(u[free], values[known].min(), values[known].max())
 
 
 class Reextension:

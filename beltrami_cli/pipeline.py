@@ -30,6 +30,8 @@ from beltrami_cli.surface import Mesh, surface_mesh
 
 # eps of the flows l1 and tv as a share of the data's typical slope: small enough that nearly every slope counts as an edge.
 EPS_SHARE = 0.1
+# Parts of the surface without data are worth a warning above this share of the band: below it are lone voxels.
+LONE_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,9 +250,9 @@ def _solve(
         samples = band.gather(plane.forth(data))
     with phases("extend"):
         start = extend(band, samples, settings.extension)
-        lost = int(np.isnan(start.values).sum())
-        if lost:
-            warnings.add(f"{lost} of {band.entries} band entries lie on parts of the surface without any data: missing")
+        missing = np.isnan(start.values[band.primary]).mean()
+        if missing > LONE_SHARE:
+            warnings.add(f"{100 * missing:.1f} % of the band lies on parts of the surface without any data: left missing")
         u0 = np.where(np.isnan(start.values), 0, start.values)  # linked to nothing but one another
     flow = Flow(settings.flow, settings.phi_name, settings.scheme)
     slope = typical_slope(band, u0, start.known)
@@ -369,7 +371,8 @@ def _record(
             "entries": band.entries,
             "half_width_mm": band.half_width,
             "surface_vertices": 0 if band.surface is None else len(band.surface.points),
-            "filled_voxels": int((~known[primary]).sum()),
+            "filled_voxels": int((~known[primary] & ~np.isnan(values[primary])).sum()),
+            "missing_voxels": int(np.isnan(values[primary]).sum()),
         },
         "Iterations": schedule.iterations,
         "StopReason": evolution.stop_reason,

@@ -58,3 +58,14 @@ def flood(u, forward, backward):
         if kept == left:
             return
         left = kept
+
+
+@nb.njit(cache=True, parallel=True)
+def minus_laplacian(u, free, forward, backward, spacing, out):
+    """-Laplacian of u (per mm^2) over links at the free entries, 0 at the others, into out (E,)."""
+    for m in nb.prange(len(u)):
+        total = 0.0
+        if free[m]:
+            for a in range(3):
+                total += (2 * u[m] - u[forward[a, m]] - u[backward[a, m]]) / spacing[a] ** 2
+        out[m] = total
