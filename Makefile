@@ -10,7 +10,7 @@ help:  ## list the targets
 	@echo "  PYTHON=$(PYTHON) (3.11 or newer) and VENV=$(VENV) can be set on the command line"
 
 demo: $(VENV)/.installed-demo  ## denoise a small surface: picture and mesh in demo_out/
-	$(BIN)/beltrami demo demo_out --overwrite
+	$(BIN)/beltrami demo demo_out --from sample_data/torus --overwrite
 
 test: $(VENV)/.installed-dev  ## run the tests
 	$(BIN)/python -m pytest

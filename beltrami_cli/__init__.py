@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 __all__ = ["Result", "__version__", "denoise"]
 
 if TYPE_CHECKING:
-    from beltrami_cli.pipeline import Result, denoise
+    from beltrami_cli.solver import Result, denoise
 
 
 def __getattr__(name: str) -> Any:
     """Import the numerics on first use, so that `import beltrami_cli` and `beltrami --help` stay light (PEP 562)."""
     if name in __all__:
-        from beltrami_cli import pipeline
-
-        return getattr(pipeline, name)
+        return getattr(import_module("beltrami_cli.solver"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -38,10 +38,9 @@ class Beta:
 
     def over(self, iterations: int) -> np.ndarray:
         """(K,) beta of each iteration."""
-        if self.law == "linear":
-            return np.linspace(*self.values, iterations)
-        if self.law == "geometric":
-            return np.geomspace(*self.values, iterations)
+        if self.law is not None:
+            start, stop = self.values
+            return (np.linspace if self.law == "linear" else np.geomspace)(start, stop, iterations)
         stretch = np.arange(iterations) * len(self.values) // max(iterations, 1)
         return np.array(self.values)[stretch]
 
@@ -59,6 +58,7 @@ def parse_beta(given: Any) -> Beta:
     """
     if isinstance(given, Beta):
         return given
+    values: tuple[float, ...]
     try:
         law = None
         if isinstance(given, Mapping):
@@ -74,11 +74,11 @@ def parse_beta(given: Any) -> Beta:
             if len(laws) > 1:
                 raise ValueError
         else:
-            parts = given.split(",") if isinstance(given, str) else given if isinstance(given, list | tuple) else [given]
-            values = tuple(float(part) for part in parts)
+            values = _numbers(given)
     except (ValueError, TypeError, KeyError):
         raise RefusedError(
-            f"beta: found {given!r}; expected a number (mm per data unit), START:STOP[:linear|geometric], B1,B2,... or auto"
+            f"beta: found {given!r}; expected a number (mm per data unit), START:STOP[:linear|geometric], "
+            "B1,B2,... or auto"
         ) from None
     if not values or not all(math.isfinite(v) and v >= 0 for v in values):
         raise RefusedError(f"beta: found {given!r}; expected finite values of 0 or more (mm per data unit)")
@@ -97,7 +97,7 @@ class Settings:
     dt: mm^2, None for 0.9 of the stability bound. iterations, time (mm^2), fwhm (mm): at most one of them.
     extension: a name in `extension`; extend_every: steps between re-extensions, 0 for never, None for the default.
     band: half-width in mm, None for 4 voxels of the largest spacing. inside: the sign of Psi inside.
-    outside: what OUT holds beyond the band. precision: of computation and OUT. threads: None for all the process may use.
+    outside: what OUT holds beyond the band. precision: of computation and OUT. threads: None for all that it may use.
     flat: no surface, P = I (Eqs. 10-11).
     """
 
@@ -180,7 +180,7 @@ class Settings:
         return DEFAULT_BAND * widest if self.band is None else self.band
 
     def duration(self, dt: float) -> tuple[int, float, str]:
-        """(iterations, dt in mm^2, what ends the run): a given time is met exactly, by a dt no larger than asked for."""
+        """(iterations, dt in mm^2, what ends the run); a given time is met exactly, by a dt no larger than given."""
         if self.time is None and self.fwhm is None:
             return (DEFAULT_ITERATIONS if self.iterations is None else self.iterations), dt, "iterations"
         reason = "time" if self.fwhm is None else "fwhm"
@@ -282,13 +282,18 @@ def overlaid(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
 def parse_spacing(given: Any) -> tuple[float, ...]:
     """Millimetres from "S", "SX,SY,SZ", a number or a list; raises RefusedError for anything else."""
     try:
-        parts = given.split(",") if isinstance(given, str) else given if isinstance(given, list | tuple) else [given]
-        values = tuple(float(part) for part in parts)
+        values = _numbers(given)
     except (TypeError, ValueError):
         values = ()
     if len(values) not in (1, 2, 3) or not all(math.isfinite(v) and v > 0 for v in values):
         raise RefusedError(f"spacing: found {given!r}; expected one number above 0 (mm), or one per axis: SX,SY,SZ")
     return values
+
+
+def _numbers(given: Any) -> tuple[float, ...]:
+    """Numbers from "A,B,...", a list or one number; raises TypeError or ValueError for anything else."""
+    parts = given.split(",") if isinstance(given, str) else given if isinstance(given, list | tuple) else [given]
+    return tuple(float(part) for part in parts)
 
 
 def _from_toml(path: Path, section: str, key: str, value: Any) -> Any:

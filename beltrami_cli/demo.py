@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 
 from beltrami_cli import formats, phantoms
-from beltrami_cli.config import Job, Settings
+from beltrami_cli.config import Beta, Job, Settings
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.evolve import Observer
-from beltrami_cli.pipeline import denoise, run
+from beltrami_cli.pipeline import run
 from beltrami_cli.report import draw_before_after
+from beltrami_cli.solver import denoise
 
 PEAK = 255.0  # full scale of the phantoms' data, for PSNR
 ITERATIONS = 12
-BETA = 0.1  # mm per data unit: slopes over 10 units per mm stay; the torus's borders are of 100 units and more
+BETA = Beta((0.1,))  # mm per data unit: slopes over 10 units per mm stay; the torus's borders are of 100 units and more
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ def run_demo(
         psi, truth, data = (formats.read_volume(path).data for path in (levelset, clean, noisy))
         if drawn:
             before = denoise(psi, data, affine=formats.read_grid(noisy).affine, iterations=0)
-            assert before.mesh is not None
-            assert result.mesh is not None
+            assert before.mesh is not None and before.mesh.values is not None
+            assert result.mesh is not None and result.mesh.values is not None
             draw_before_after(stage.path(picture), result.mesh, before.mesh.values, result.mesh.values)
             stage.commit()
     near = (np.abs(psi) < 0.5) & np.isfinite(result.data)
@@ -69,7 +70,9 @@ def _phantom_files(source: Path) -> tuple[Path, Path, Path]:
     for suffix in ("nii.gz", "mha", "npy"):
         if (source / f"levelset.{suffix}").exists():
             return tuple(source / f"{part}.{suffix}" for part in ("levelset", "clean", "noisy"))  # type: ignore[return-value]
-    raise RefusedError(f"{source}: holds no levelset.nii.gz, .mha or .npy; make it with: beltrami phantom torus {source}")
+    raise RefusedError(
+        f"{source}: holds no levelset.nii.gz, .mha or .npy; make it with: beltrami phantom torus {source}"
+    )
 
 
 def _make_torus(outdir: Path, overwrite: bool) -> tuple[Path, Path, Path]:

@@ -18,8 +18,8 @@ LEAST_WEIGHT = 0.125
 # Voxels to either side of the surface at which data are sampled: the two samples share no corner along the normal, and
 # lie within the voxels that the surface passes through or beside.
 HALF_STEP = 0.5
-# Filling is a start for the flow: relative residual at which it stops, and the most iterations, each of which carries the
-# rim's values one voxel further in.
+# Filling is a start for the flow: relative residual at which it stops, and the most iterations, each of which carries
+# the rim's values one voxel further in.
 FILL_TOLERANCE = 1e-3
 FILL_ITERATIONS = 100
 
@@ -38,7 +38,7 @@ class Extended:
 def extend(band: Band, samples: np.ndarray, method: str = "closest-point") -> Extended:
     """Carry data off the surface on every sheet.
 
-    samples: (E,), a volume's values at the entries (`Band.gather`), NaN where missing. Only primary entries feed a bank.
+    samples: (E,), a volume's values at the entries (`Band.gather`), NaN where missing; only primary entries count.
     method: "closest-point" (each entry takes the trilinear value of valid voxels at its closest surface point), "pde"
     (U_t + sign(Psi) grad U . grad Psi = 0, Sec. 2.1) or "none" (each voxel keeps its own value; sheets other than the
     nearest take the closest point's). Holes are then filled from the band around them.
@@ -76,8 +76,8 @@ def own_samples(band: Band, samples: np.ndarray) -> np.ndarray:
 def at_closest_points(band: Band, own: np.ndarray) -> np.ndarray:
     """(E,) values of `own` (E,) at each entry's closest point; NaN where valid corners are too few.
 
-    The mean of two trilinear samples HALF_STEP voxels on either side along the normal: exact for values linear in depth,
-    and with half the noise of one sample at the point itself.
+    The mean of two trilinear samples HALF_STEP voxels on either side along the normal: exact for values linear in
+    depth, and with less noise than one sample at the point itself.
     """
     start = np.arange(band.entries, dtype=np.int32)
     finest = band.grid.spacing[np.array(band.grid.shape) > 1].min()
@@ -91,7 +91,7 @@ def at_closest_points(band: Band, own: np.ndarray) -> np.ndarray:
 
 
 def transported(band: Band, own: np.ndarray) -> np.ndarray:
-    """(E,) solution of the initial value problem of Sec. 2.1, run for twice the time that the front takes to the rim."""
+    """(E,) solution of the initial value problem of Sec. 2.1, run for twice the time that a front takes to the rim."""
     spacing = band.grid.spacing
     used = spacing[np.array(band.grid.shape) > 1]
     dt = 0.9 / np.sqrt((1 / used**2).sum())  # mm at unit speed: the upwind scheme's own bound, with a margin
@@ -141,9 +141,7 @@ class Reextension:
     def __init__(self, band: Band) -> None:
         self.band = band
         start = np.arange(band.entries, dtype=np.int32)
-        self.origin = interpolate.stencil_origins(
-            start, band.closest_offset, band.forward, band.backward, band.nodes
-        )
+        self.origin = interpolate.stencil_origins(start, band.closest_offset, band.forward, band.backward, band.nodes)
 
     def __call__(self, u: np.ndarray, out: np.ndarray) -> None:
         """Write the re-extended u into out, both (E,); an entry whose stencil is incomplete keeps its value."""

@@ -94,9 +94,7 @@ def isosurface(psi: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np.ndar
     from skimage.measure import marching_cubes
 
     try:
-        ijk, cells, _, _ = marching_cubes(
-            psi, 0.0, mask=None if finite.all() else finite
-        )
+        ijk, cells, _, _ = marching_cubes(psi, 0.0, mask=None if finite.all() else finite)
     except (ValueError, RuntimeError):  # no cell is crossed among the finite values
         return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
     return ijk.astype(np.float64), cells.astype(np.int32)

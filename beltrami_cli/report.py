@@ -11,7 +11,8 @@ from beltrami_cli.errors import RefusedError
 from beltrami_cli.formats import checks
 from beltrami_cli.surface import Mesh
 
-DPI = 150  # a sheet of 1,800 pixels across: every triangle of a usual cortex patch covers several
+DPI = 200  # a panel of 1,000 pixels across: every triangle of a usual cortex patch covers several
+PANEL_INCHES = 5.5
 PERCENTILES = (2.0, 98.0)  # a few outliers must not take the whole colour scale
 MISSING = (0.62, 0.62, 0.62)  # grey: no colour of the map
 
@@ -19,7 +20,7 @@ MISSING = (0.62, 0.62, 0.62)  # grey: no colour of the map
 THREE_QUARTER = np.array([0.45, -0.6, 0.66])
 # Share of the area by which one side must prevail to be the one that is looked at; a closed surface has 0.
 ONE_SIDED = 0.1
-AMBIENT = 0.35  # brightness, of 1, where the surface turns away from the headlight at the camera
+AMBIENT = 0.5  # brightness, of 1, where the surface turns away from the headlight at the camera
 
 # Red, green and blue as in the paper's figures, in shades that stay apart without full colour vision.
 TRUTH, INPUT, DENOISED = "#d62718", "#7fc4a5", "#0b4fa8"
@@ -39,75 +40,74 @@ def draw_before_after(
     """Write a PNG that shows values on the surface before and after, or along a curve, whatever the path's suffix.
 
     mesh: its `values` are not used. before, after, truth: (V,) values at its vertices, NaN where missing.
-    A surface gets one panel each, lit from the camera, on one colour scale (2nd to 98th percentile of `after`), missing
-    values grey; a curve gets one line each over the arc length.
+    A surface gets one panel each, lit from the camera, on one colour scale (2nd to 98th percentile of `after` where
+    `before` is known), missing values grey; a curve gets one line each over the arc length.
 
     Raises RefusedError where matplotlib is missing, DataError where the file cannot be written.
     """
     panels = {title_before: before, title_after: after}
     if truth is not None:
         panels["truth"] = truth
-    for values in panels.values():
+    for title, values in panels.items():
         if np.shape(values) != (len(mesh.vertices_ras_mm),):
-            raise ValueError(f"expected one value for each of {len(mesh.vertices_ras_mm)} vertices, got {np.shape(values)}")
-    panels = {title: np.where(np.isfinite(values), values, np.nan) for title, values in panels.items()}
-    figure = _new_figure(len(panels), curve=mesh.cells.shape[1] == 2)
-    if mesh.cells.shape[1] == 2:
-        _draw_curve(figure, mesh, panels, label)
-    else:
-        _draw_surface(figure, mesh, panels, _colour_range(panels[title_after], before), label)
+            raise ValueError(f"{title}: expected {len(mesh.vertices_ras_mm)} values, got shape {np.shape(values)}")
+        panels[title] = np.where(np.isfinite(values), values, np.nan)
+    figure = _new_figure()
+    draw = _draw_curve if mesh.cells.shape[1] == 2 else _draw_surface
+    draw(figure, mesh, panels, label)
     with checks.writing(path):
         figure.savefig(path, format="png", dpi=DPI)
 
 
-def _new_figure(panels: int, *, curve: bool) -> Any:
+def _new_figure() -> Any:
     """An empty figure that belongs to no window and no global state."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise RefusedError(
-            "report: pictures need matplotlib, which is not installed; pip install 'beltrami_cli[report]'"
+            "pictures need matplotlib, which is not installed; pip install 'beltrami_cli[report]'"
         ) from error
-    return Figure(figsize=(10, 4.5) if curve else (6 * panels, 6.2), layout="constrained", facecolor="white")
+    return Figure(layout="constrained", facecolor="white")
 
 
-def _colour_range(after: np.ndarray, before: np.ndarray) -> tuple[float, float]:
-    """Ends of the colour scale; those of `before` where `after` says nothing, (0, 1) where neither does."""
-    for values in (after, before):
+# Surfaces
+
+
+def _draw_surface(figure: Any, mesh: Mesh, panels: dict[str, np.ndarray], label: str) -> None:
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    before, after, *_ = panels.values()
+    scale = ScalarMappable(Normalize(*_colour_range(before, after)), colormaps["viridis"].with_extremes(bad=MISSING))
+    points = mesh.vertices_ras_mm - mesh.vertices_ras_mm.mean(0)
+    area = _area_vectors(points, mesh.cells)
+    known = np.isfinite(before)[mesh.cells].all(1)
+    camera = _camera(area[known] if known.any() else area)
+    across, up, depth = camera @ points.T
+    farthest_first = np.argsort(depth[mesh.cells].mean(1))
+    light = AMBIENT + (1 - AMBIENT) * np.abs(_vertex_normals(area, mesh.cells, len(points)) @ camera[2])
+
+    height = PANEL_INCHES * np.clip(np.ptp(up) / np.ptp(across), 0.4, 1.6)
+    figure.set_size_inches(PANEL_INCHES * len(panels) + 1, height + 0.5)
+    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (title, values) in zip(all_axes, panels.items(), strict=True):
+        colours = scale.to_rgba(np.ma.masked_invalid(values))
+        colours[:, :3] *= light[:, None]
+        _paint(axes, across, up, mesh.cells[farthest_first], colours)
+        axes.set_title(title, fontsize=16)
+    figure.colorbar(scale, ax=all_axes, label=label, shrink=0.8, aspect=30, extend="both")
+
+
+def _colour_range(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """Ends of the colour scale: set by the surface's known part after, else by all of it, else before, else (0, 1)."""
+    for values in (after[np.isfinite(before)], after, before):
         finite = values[np.isfinite(values)]
         if finite.size:
             low, high = np.percentile(finite, PERCENTILES)
             if high > low:
                 return float(low), float(high)
     return 0.0, 1.0
-
-
-# Surfaces
-
-
-def _draw_surface(
-    figure: Any, mesh: Mesh, panels: dict[str, np.ndarray], limits: tuple[float, float], label: str
-) -> None:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    scale = ScalarMappable(Normalize(*limits), "viridis")
-    scale.cmap.set_bad(MISSING)
-    points = mesh.vertices_ras_mm - mesh.vertices_ras_mm.mean(0)
-    area = _area_vectors(points, mesh.cells)
-    seen = np.logical_or.reduce([np.isfinite(values) for values in panels.values()])
-    camera = _camera(area[seen[mesh.cells].all(1)] if seen.any() else area)
-    across, up, depth = camera @ points.T
-    farthest_first = np.argsort(depth[mesh.cells].mean(1))
-    light = AMBIENT + (1 - AMBIENT) * np.abs(_vertex_normals(area, mesh.cells, len(points)) @ camera[2])
-
-    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, (title, values) in zip(all_axes, panels.items(), strict=True):
-        colours = scale.to_rgba(np.ma.masked_invalid(values))
-        colours[:, :3] *= light[:, None]
-        _paint(axes, across, up, mesh.cells[farthest_first], colours)
-        axes.set_title(title, fontsize=15)
-    figure.colorbar(scale, ax=all_axes, label=label, shrink=0.7, extend="both")
 
 
 def _paint(axes: Any, across: np.ndarray, up: np.ndarray, triangles: np.ndarray, colours: np.ndarray) -> None:
@@ -155,6 +155,7 @@ def _vertex_normals(area: np.ndarray, triangles: np.ndarray, count: int) -> np.n
 
 
 def _draw_curve(figure: Any, mesh: Mesh, panels: dict[str, np.ndarray], label: str) -> None:
+    figure.set_size_inches(10, 4.5)
     axes = figure.subplots()
     vertices, arc = _along(mesh)
     before, after, *truth = panels.items()

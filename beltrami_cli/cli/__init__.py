@@ -17,8 +17,8 @@ from beltrami_cli.cli.info import info
 from beltrami_cli.cli.mesh import mesh
 from beltrami_cli.cli.phantom import phantom
 
-EPILOG = """Exit codes: 0 done; 1 the data or the numerics failed, or a comparison is out of tolerance; 2 usage, or refused
-before starting; 130 on Ctrl-C; 143 on SIGTERM.
+EPILOG = """Exit codes: 0 done; 1 the data or the numerics failed, or a comparison is out of tolerance; 2 usage, or
+refused before starting; 130 on Ctrl-C; 143 on SIGTERM.
 
 Shell completion: eval "$(_BELTRAMI_COMPLETE=bash_source beltrami)" (or zsh_source, fish_source)."""
 
@@ -38,8 +38,13 @@ def main(args: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, _terminate)
     try:
         code = beltrami.main(args, prog_name="beltrami", standalone_mode=False)
-    except click.ClickException as error:
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
+        return error.exit_code
+    except click.ClickException as error:
+        if isinstance(error, click.UsageError) and error.ctx is not None:
+            click.echo(error.ctx.get_usage(), err=True)
+        click.echo(f"beltrami: {error.format_message()}", err=True)
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):
         click.echo("beltrami: interrupted; nothing was written", err=True)

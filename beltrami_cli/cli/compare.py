@@ -49,7 +49,8 @@ def compare(
     else:
         say(quiet, f"compared  {found.compared} voxels ({found.only_in_a} only in A, {found.only_in_b} only in B)")
         say(quiet, f"B - A     max {found.max_abs:.6g}, rms {found.rms:.6g}, mean {found.mean:.6g}")
-        say(quiet, f"psnr      {found.psnr:.2f} dB over a range of {found.data_range:.6g}; correlation {found.correlation:.6f}")
+        say(quiet, f"psnr      {found.psnr:.2f} dB over a range of {found.data_range:.6g}")
+        say(quiet, f"correlation {found.correlation:.6f}")
     for line in broken:
         click.echo(f"beltrami: out of tolerance: {line}", err=True)
     return 1 if broken else 0

@@ -14,9 +14,14 @@ FILE = click.Path(path_type=Path)
 
 @click.command(cls=Command)
 @click.argument("inputs", nargs=-1, type=FILE, metavar="LEVELSET DATA")
-@click.option("-o", "--output", "volume", type=FILE, metavar="OUT", help="The denoised volume (.nii.gz .mha .npy .mgz).")
 @click.option(
-    "--mesh", type=FILE, multiple=True, help="The surface with the denoised values; may be repeated. Default: beside OUT."
+    "-o", "--output", "volume", type=FILE, metavar="OUT", help="The denoised volume (.nii.gz .mha .npy .mgz)."
+)
+@click.option(
+    "--mesh",
+    type=FILE,
+    multiple=True,
+    help="The surface with the denoised values; may be repeated. Default: beside OUT.",
 )
 @click.option("--no-mesh", is_flag=True, default=None, help="Write no mesh.")
 @click.option("--config", type=FILE, help="A TOML file with any of this; the command line overrides it.")
@@ -30,10 +35,12 @@ FILE = click.Path(path_type=Path)
 @click.option(
     "--beta",
     metavar="B|A:B[:LAW]|B1,B2,..|auto",
-    help="Keeps edges steeper than 1/beta (beta in mm per data unit): a number, a run from A to B (linear or geometric), "
-    "equal stretches of several, or auto: 1 / the data's median slope, noise included. Default: auto.",
+    help="Keeps edges steeper than 1/beta (beta in mm per data unit): a number, a run from A to B (linear or "
+    "geometric), equal stretches of several, or auto: 1 / the data's median slope, noise included. Default: auto.",
 )
-@click.option("--eps", type=float, help="Slope (data units per mm) under which l1 and tv smooth. Default: a tenth of median.")
+@click.option(
+    "--eps", type=float, help="Slope (data units per mm) under which l1 and tv smooth. Default: a tenth of median."
+)
 @click.option(
     "--scheme",
     type=click.Choice(["symmetric", "paper"]),
@@ -51,14 +58,18 @@ FILE = click.Path(path_type=Path)
     help="How data are carried off the surface. Default: closest-point.",
 )
 @click.option("--extend-every", type=int, metavar="K", help="Steps between re-extensions, 0 for never. Default: 5.")
-@click.option("--band", type=float, metavar="MM", help="Half-width of the band. Default: 4 voxels of the largest spacing.")
+@click.option(
+    "--band", type=float, metavar="MM", help="Half-width of the band. Default: 4 voxels of the largest spacing."
+)
 @click.option("--spacing", metavar="S|SX,SY,SZ", help="Voxel size in mm of .npy inputs. Default: 1.")
 @click.option("--resample", is_flag=True, default=None, help="Bring DATA onto LEVELSET's grid (trilinear).")
 @click.option("--inside", type=click.Choice(["negative", "positive"]), help="Psi's sign inside. Default: negative.")
 @click.option(
     "--outside", type=click.Choice(["nan", "zero", "keep"]), help="What OUT holds beyond the band. Default: nan."
 )
-@click.option("--precision", type=click.Choice(["float32", "float64"]), help="Of computation and OUT. Default: float32.")
+@click.option(
+    "--precision", type=click.Choice(["float32", "float64"]), help="Of computation and OUT. Default: float32."
+)
 @click.option("--threads", type=int, help="Default: the CPUs that the process may use.")
 def denoise(inputs: tuple[Path, ...], config: Path | None, quiet: bool, verbose: int, **options: Any) -> int:
     """Denoise DATA along the surface where LEVELSET is zero, keeping edges.
@@ -135,8 +146,8 @@ def _tell_details(record: dict[str, Any]) -> None:
     if each["beta"]:
         note(
             False,
-            f"flow: dt {each['dt'][0]:.5g} mm^2, beta {each['beta'][0]:.5g} to {each['beta'][-1]:.5g}, typical slope of "
-            f"the data {record['TypicalSlope']:.5g} per mm",
+            f"flow: dt {each['dt'][0]:.5g} mm^2, beta {each['beta'][0]:.5g} to {each['beta'][-1]:.5g}, "
+            f"typical slope of the data {record['TypicalSlope']:.5g} per mm",
         )
     phases = ", ".join(f"{name} {seconds:.2f}" for name, seconds in record["Seconds"].items())
     note(False, f"seconds: {phases}; peak memory {record['PeakMemoryMiB']} MiB")

@@ -17,7 +17,9 @@ NAMES = ("torus", "sphere", "plane", "curve", "portrait", "sulcus")
 @click.argument("name", type=click.Choice(NAMES))
 @click.argument("outdir", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--size", type=int, metavar="N", help="Voxels along each axis; the default depends on the phantom.")
-@click.option("--noise", type=float, metavar="SIGMA", help="Standard deviation per voxel; the default depends likewise.")
+@click.option(
+    "--noise", type=float, metavar="SIGMA", help="Standard deviation per voxel; the default depends likewise."
+)
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the noise.")
 @click.option("--format", "suffix", type=click.Choice(["nii.gz", "mha", "npy"]), default="nii.gz", show_default=True)
 @click.option("--map", "torus_map", type=click.Choice(["mixed", "pieces", "smooth"]), help="Data on the torus.")

@@ -66,7 +66,7 @@ def stencil_origin(corner, forward, backward, nodes):
 
 @nb.njit(cache=True, parallel=True)
 def stencil_origins(start, offset, forward, backward, nodes):
-    """For each query (start (Q,), offset (3, Q) in voxels) the origin (Q,) of its whole stencil, -1 where incomplete."""
+    """For each query (start (Q,), offset (3, Q) in voxels) the origin (Q,) of its stencil, -1 where incomplete."""
     out = np.empty(len(start), np.int32)
     for m in nb.prange(len(start)):
         s0, s1, s2 = int(np.floor(offset[0, m])), int(np.floor(offset[1, m])), int(np.floor(offset[2, m]))
@@ -91,7 +91,8 @@ def cubic_weights(t, nodes, w):
 def cubic(u, origin, offset, forward, nodes, out):
     """Local cubic of u at each query, within the range of the cell's own nodes, into out (Q,).
 
-    `origin` and `offset` as for `stencil_origins`. Where the stencil is incomplete (-1) or holds a NaN, out is left as it is.
+    `origin` and `offset` as for `stencil_origins`. Where the stencil is incomplete (-1) or holds a NaN, out keeps its
+    value.
     """
     f0, f1, f2 = forward[0], forward[1], forward[2]
     queries = len(origin)

@@ -10,8 +10,8 @@ import numpy as np
 # Two vertices seen from one voxel are of one sheet when they are within 2 voxels and their normals within 70 degrees.
 TWIN_VOXELS = 2.0
 TWIN_COSINE = 0.34
-# A vertex stands for a voxel only when the voxel lies along its normal: aside by no more than 1 voxel (the vertices' own
-# spacing) or by this share of the distance (the bend of the normals in between).
+# A vertex stands for a voxel only when the voxel lies along its normal: aside by no more than 1 voxel (the vertices'
+# own spacing) or by this share of the distance (the bend of the normals in between).
 ASIDE = 0.66
 # Neighbouring entries are of one bank when their vertices are within 2.5 voxels and their normals are not opposed.
 LINK_VOXELS = 2.5
@@ -24,11 +24,11 @@ def squared_distance(points, v, x0, x1, x2):
 
 
 @nb.njit(cache=True, inline="always")
-def squared_voxels(points, v, w, spacing):
+def squared_voxels(points, v, w, per_voxel):
     return (
-        ((points[v, 0] - points[w, 0]) / spacing[0]) ** 2
-        + ((points[v, 1] - points[w, 1]) / spacing[1]) ** 2
-        + ((points[v, 2] - points[w, 2]) / spacing[2]) ** 2
+        ((points[v, 0] - points[w, 0]) * per_voxel[0]) ** 2
+        + ((points[v, 1] - points[w, 1]) * per_voxel[1]) ** 2
+        + ((points[v, 2] - points[w, 2]) * per_voxel[2]) ** 2
     )
 
 
@@ -70,6 +70,7 @@ def grow(shape, spacing, points, normals, start, ring, half_width):
     distance = np.empty(capacity)
     entries = 0
     pace = np.max(spacing) ** 2
+    per_voxel = 1 / spacing
     reach = (half_width + 0.5 * np.max(spacing)) ** 2
     at = np.empty(3, np.int64)
     seed, grown = 0, 0
@@ -83,7 +84,11 @@ def grow(shape, spacing, points, normals, start, ring, half_width):
             seed += 1
         else:
             v = vertex[grown]
-            at[0], at[1], at[2] = voxel[grown] // stride[0], voxel[grown] // stride[1] % shape[1], voxel[grown] % shape[2]
+            at[0], at[1], at[2] = (
+                voxel[grown] // stride[0],
+                voxel[grown] // stride[1] % shape[1],
+                voxel[grown] % shape[2],
+            )
             tries = 6
             grown += 1
         for step in range(tries):
@@ -105,7 +110,7 @@ def grow(shape, spacing, points, normals, start, ring, half_width):
                 w = vertex[e]
                 if w == v or (
                     tries == 6
-                    and squared_voxels(points, v, w, spacing) < 1.0
+                    and squared_voxels(points, v, w, per_voxel) < TWIN_VOXELS**2
                     and cosine(normals, v, w) > TWIN_COSINE
                 ):
                     known = True
@@ -128,7 +133,7 @@ def grow(shape, spacing, points, normals, start, ring, half_width):
             while e >= 0:
                 o = vertex[e]
                 if o == w or (
-                    squared_voxels(points, o, w, spacing) < TWIN_VOXELS**2 and cosine(normals, o, w) > TWIN_COSINE
+                    squared_voxels(points, o, w, per_voxel) < TWIN_VOXELS**2 and cosine(normals, o, w) > TWIN_COSINE
                 ):
                     if d < distance[e]:
                         vertex[e], distance[e] = w, d
@@ -187,8 +192,9 @@ def arrange(voxel, vertex, distance, after, head):
 def closest_points(voxel, vertex, shape, spacing, points, normals, curvature, direction):
     """Unit normal (3, E) at each entry's closest surface point, and the signed distance to it (E,), mm.
 
-    The surface around vertex v is taken as the quadric of its principal curvatures: for x = v + a + h n with a tangent,
-    the closest point lies at t_i = a_i / (1 + d k_i) along the principal directions, d = h + sum k_i t_i^2 (1 + d k_i) / 2.
+    The surface around vertex v is taken as the quadric of its principal curvatures: for x = v + a + h n with a
+    tangent, the closest point lies at t_i = a_i / (1 + d k_i) along the principal directions, and
+    d = h + sum k_i t_i^2 (1 + d k_i) / 2.
     """
     entries = len(voxel)
     normal, distance = np.empty((3, entries), np.float32), np.empty(entries, np.float32)
@@ -220,6 +226,7 @@ def best_matches(voxel, vertex, first, normal, shape, spacing, points, axis, mov
     """For each entry the entry of its neighbour along the axis that has the nearest vertex; itself where none has."""
     stride = (shape[1] * shape[2], shape[2], 1)
     out = np.empty(len(voxel), np.int32)
+    per_voxel = 1 / spacing
     for e in nb.prange(len(voxel)):
         out[e] = e
         i = voxel[e] // stride[axis] % shape[axis] + move
@@ -229,7 +236,7 @@ def best_matches(voxel, vertex, first, normal, shape, spacing, points, axis, mov
         best = LINK_VOXELS**2
         for o in range(first[y], first[y + 1]):
             facing = normal[0, e] * normal[0, o] + normal[1, e] * normal[1, o] + normal[2, e] * normal[2, o]
-            apart = squared_voxels(points, vertex[e], vertex[o], spacing)
+            apart = squared_voxels(points, vertex[e], vertex[o], per_voxel)
             if facing > LINK_COSINE and apart < best:
                 best = apart
                 out[e] = o
@@ -248,11 +255,12 @@ def mutual_links(forward, backward):
 
 @nb.njit(cache=True, parallel=True)
 def entries_at_vertices(voxel, vertex, first, shape, spacing, points, ijk):
-    """For each mesh vertex the entry of its own sheet beside it (V,), -1 where none, and the offset (3, V) from its voxel.
+    """For each mesh vertex the entry of its own sheet beside it (V,), -1 where none, and the offset (3, V) from it.
 
     Of the entries in the eight voxels around, the one whose own vertex is nearest.
     """
     start, offset = np.full(len(ijk), -1, np.int32), np.zeros((3, len(ijk)), np.float32)
+    per_voxel = 1 / spacing
     for v in nb.prange(len(ijk)):
         best = LINK_VOXELS**2
         for corner in range(8):
@@ -263,7 +271,7 @@ def entries_at_vertices(voxel, vertex, first, shape, spacing, points, ijk):
                 continue
             x = (i * shape[1] + j) * shape[2] + k
             for e in range(first[x], first[x + 1]):
-                apart = squared_voxels(points, vertex[e], v, spacing)
+                apart = squared_voxels(points, vertex[e], v, per_voxel)
                 if apart < best:
                     best = apart
                     start[v] = e

@@ -1,7 +1,7 @@
 """One explicit step of U_t = a Div(c v), v = P grad U, on the compact band; scalar values.
 
-Arrays run over the band's E entries: u (E,), normal (3, E), forward and backward (3, E) neighbour entries, a missing link
-pointing to the entry itself. Work is cut in blocks of fixed size, so sums do not depend on the number of threads.
+Arrays run over the band's E entries: u (E,), normal (3, E), forward and backward (3, E) neighbour entries, a missing
+link pointing to the entry itself. Work is cut in blocks of fixed size, so sums do not depend on the number of threads.
 """
 
 import numba as nb

@@ -1,0 +1,104 @@
+"""What a run leaves behind in words: every parameter as used, and what happened (the JSON sidecar)."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+
+from beltrami_cli import __version__
+from beltrami_cli.band import Band
+from beltrami_cli.config import Job, Settings
+from beltrami_cli.evolve import Evolution, Schedule
+from beltrami_cli.grid import Grid
+
+
+def what_happened(
+    settings: Settings,
+    grid: Grid,
+    band: Band,
+    schedule: Schedule,
+    evolution: Evolution,
+    slope: float,
+    samples: np.ndarray,
+    values: np.ndarray,
+    known: np.ndarray,
+) -> dict[str, Any]:
+    """What was used and what happened, JSON-ready; lengths mm, dt mm^2, beta mm per data unit."""
+    primary = band.primary
+    near = primary[np.abs(band.distance[primary]) <= 0.5 * grid.spacing.max()]
+    removed = (samples[near] - values[near]).astype(float)
+    removed = removed[np.isfinite(removed)]
+    used = {**asdict(settings), "beta": str(settings.beta), "band": band.half_width, "dt": schedule.dt}
+    used["extend_every"] = settings.reextends_every
+    used["threads"] = numba.get_num_threads()
+    used["eps"] = 1 / schedule.beta[0] if settings.flow in ("l1", "tv") and schedule.beta.any() else None
+    used["phi"] = settings.phi_name if settings.flow == "phi" else None
+    return {
+        "Parameters": used,
+        "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
+        "Band": {
+            "voxels": len(primary),
+            "entries": band.entries,
+            "half_width_mm": band.half_width,
+            "surface_vertices": 0 if band.surface is None else len(band.surface.points),
+            "filled_voxels": int((~known[primary] & ~np.isnan(values[primary])).sum()),
+            "missing_voxels": int(np.isnan(values[primary]).sum()),
+        },
+        "Iterations": schedule.iterations,
+        "StopReason": evolution.stop_reason,
+        "TimeMm2": schedule.dt * schedule.iterations,
+        "TypicalSlope": slope,
+        "Removed": {
+            "rms": float(np.sqrt(np.mean(removed**2))) if removed.size else None,
+            "voxels": int(removed.size),
+            "meaning": "input minus output at valid voxels within half a voxel of the surface",
+        },
+        "PerIteration": {
+            "beta": schedule.beta.tolist(),
+            "dt": [schedule.dt] * schedule.iterations,
+            "dt_over_beta": [schedule.dt / beta if beta else None for beta in schedule.beta.tolist()],
+            "change_rms": evolution.change.tolist(),
+            "energy": evolution.energy.tolist(),
+        },
+    }
+
+
+def sidecar(
+    job: Job,
+    files: list[Path],
+    hashes: list[str],
+    happened: dict[str, Any],
+    warnings: tuple[str, ...],
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    """The record of a run on files, with names as in BIDS derivatives."""
+    return {
+        "GeneratedBy": [{"Name": "beltrami_cli", "Version": __version__}],
+        "Sources": [
+            {"Path": os.fspath(path), "SHA256": digest} for path, digest in zip(job.inputs, hashes, strict=True)
+        ],
+        "Outputs": [file.name for file in files],
+        "Created": datetime.now(UTC).isoformat(timespec="seconds"),
+        **happened,
+        "Files": {"resample": job.resample, "spacing": job.spacing},
+        "Warnings": list(warnings),
+        "Seconds": {name: round(spent, 3) for name, spent in seconds.items()},
+        "PeakMemoryMiB": _peak_memory_mib(),
+    }
+
+
+def _peak_memory_mib() -> float | None:
+    """Largest resident set of this process so far; None where the system does not say (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
