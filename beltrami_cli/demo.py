@@ -13,9 +13,8 @@ from beltrami_cli import formats, phantoms
 from beltrami_cli.config import Beta, Job, Settings
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.evolve import Observer
-from beltrami_cli.pipeline import run
+from beltrami_cli.pipeline import mesh_of, run
 from beltrami_cli.report import draw_before_after
-from beltrami_cli.solver import denoise
 
 PEAK = 255.0  # full scale of the phantoms' data, for PSNR
 ITERATIONS = 12
@@ -52,10 +51,9 @@ def run_demo(
         result = run(job, observer=observer)
         psi, truth, data = (formats.read_volume(path).data for path in (levelset, clean, noisy))
         if drawn:
-            before = denoise(psi, data, affine=formats.read_grid(noisy).affine, iterations=0)
-            assert before.mesh is not None and before.mesh.values is not None
-            assert result.mesh is not None and result.mesh.values is not None
-            draw_before_after(stage.path(picture), result.mesh, before.mesh.values, result.mesh.values)
+            before = mesh_of(levelset, noisy).values
+            assert before is not None and result.mesh is not None and result.mesh.values is not None
+            draw_before_after(stage.path(picture), result.mesh, before, result.mesh.values)
             stage.commit()
     near = (np.abs(psi) < 0.5) & np.isfinite(result.data)
     return Demo(

@@ -22,6 +22,7 @@ from beltrami_cli.record import sidecar
 from beltrami_cli.resample import resample
 from beltrami_cli.sampling import surface_mesh
 from beltrami_cli.solver import PlaneLast, Result, Warnings, band_of, require_usable, solve, time_step
+from beltrami_cli.surface import Mesh
 
 
 def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], None] | None = None) -> Result:
@@ -53,39 +54,29 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
     return replace(solved, record=record)
 
 
-def run_mesh(
+def mesh_of(
     levelset: Path,
-    data: Path | None,
-    output: Path,
+    data: Path | None = None,
     *,
     spacing: tuple[float, ...] | None = None,
     bring: bool = False,
     inside: str = "negative",
-    overwrite: bool = False,
-) -> list[Path]:
-    """Write the surface of a level set, with the data as they are at its vertices (NaN where missing).
+) -> Mesh:
+    """The surface of a level set in RAS mm, with the data as they are at its vertices (NaN where missing).
 
-    bring: resample the data onto the level set's grid. Returns the files written; raises as `run`.
+    bring: resample the data onto the level set's grid. Raises as `run`.
     """
-    sources = [path for path in (levelset, data) if path is not None]
-    grids = [formats.read_grid(path, spacing=_spacing_for(path, spacing)) for path in sources]
-    if data is not None and not bring:
-        require_same_grid(grids[0], f"LEVELSET {levelset}", grids[1], f"DATA {data}")
-    require_usable(grids[0], str(levelset))
-    files = formats.mesh_files(output, values=data is not None, curve=1 in grids[0].shape)
-    with formats.Stage(files, overwrite=overwrite, inputs=sources) as stage:
-        psi = formats.read_volume(levelset, spacing=_spacing_for(levelset, spacing))
-        plane, settings = PlaneLast(psi.grid), Settings(inside=inside)
-        band = band_of(psi.data, settings, plane, Warnings(None))
-        values = None
-        if data is not None:
-            volume = formats.read_volume(data, spacing=_spacing_for(data, spacing))
-            if bring:
-                volume = resample(volume, psi.grid)
-            values = own_samples(band, band.gather(plane.forth(volume.data)))
-        formats.write_mesh(stage.path(output), surface_mesh(band, values))
-        stage.commit()
-    return files
+    psi = formats.read_volume(levelset, spacing=_spacing_for(levelset, spacing))
+    require_usable(psi.grid, str(levelset))
+    plane = PlaneLast(psi.grid)
+    band = band_of(psi.data, Settings(inside=inside), plane, Warnings(None))
+    if data is None:
+        return surface_mesh(band)
+    volume = formats.read_volume(data, spacing=_spacing_for(data, spacing))
+    if bring:
+        volume = resample(volume, psi.grid)
+    require_same_grid(psi.grid, f"LEVELSET {levelset}", volume.grid, f"DATA {data}")
+    return surface_mesh(band, own_samples(band, band.gather(plane.forth(volume.data))))
 
 
 class _Files:

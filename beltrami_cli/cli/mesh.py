@@ -34,18 +34,17 @@ def mesh(
 
     A vertex beside which DATA has no value gets NaN. GIFTI writes the values to .func.gii beside the .surf.gii.
     """
+    from beltrami_cli import formats
     from beltrami_cli.config import parse_spacing
-    from beltrami_cli.pipeline import run_mesh
+    from beltrami_cli.pipeline import mesh_of
 
-    announce_compilation(quiet)
-    written = run_mesh(
-        levelset,
-        data,
-        output,
-        spacing=parse_spacing(spacing) if spacing else None,
-        bring=resample,
-        inside=inside,
-        overwrite=bool(overwrite),
-    )
-    say(quiet, f"wrote {', '.join(map(str, written))}")
+    curve = 1 in formats.read_grid(levelset).shape
+    files = formats.mesh_files(output, values=data is not None, curve=curve)
+    with formats.Stage(files, overwrite=bool(overwrite), inputs=[p for p in (levelset, data) if p]) as stage:
+        announce_compilation(quiet)
+        steps = parse_spacing(spacing) if spacing else None
+        surface = mesh_of(levelset, data, spacing=steps, bring=resample, inside=inside)
+        formats.write_mesh(stage.path(output), surface)
+        stage.commit()
+    say(quiet, f"wrote {', '.join(map(str, files))}")
     return 0
