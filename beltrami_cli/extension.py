@@ -111,27 +111,9 @@ def fill(band: Band, values: np.ndarray, known: np.ndarray) -> None:
     range of the known ones. Banks without any known value stay NaN.
     """
     kernels.flood(values, band.forward, band.backward)
-    free = ~known & ~np.isnan(values)
-    u = np.where(np.isnan(values), 0, values).astype(np.float64)
-    image = np.empty_like(u)
-
-    def apply(v: np.ndarray) -> np.ndarray:
-        kernels.minus_laplacian(v, free, band.forward, band.backward, band.grid.spacing, image)
-        return image
-
-    residual = -apply(u)
-    direction, size = residual.copy(), float(residual @ residual)
-    target = FILL_TOLERANCE**2 * size
-    for _ in range(FILL_ITERATIONS):
-        if size <= target:
-            break
-        curved = apply(direction)
-        stride = size / float(direction @ curved)
-        u += stride * direction
-        residual -= stride * curved
-        size, before = float(residual @ residual), size
-        direction *= size / before
-        direction += residual
+    free = np.flatnonzero(~known & ~np.isnan(values)).astype(np.int32)
+    u = np.nan_to_num(values.astype(np.float64), nan=0.0)
+    kernels.relax(u, free, band.forward, band.backward, band.grid.spacing, FILL_TOLERANCE, FILL_ITERATIONS)
     values[free] = np.clip(u[free], values[known].min(), values[known].max())
 
 

@@ -3,6 +3,8 @@
 import numba as nb
 import numpy as np
 
+from beltrami_cli.kernels import BLOCK
+
 
 @nb.njit(cache=True, parallel=True)
 def transport(u, normal, distance, forward, backward, spacing, width, dt, out):
@@ -61,11 +63,51 @@ def flood(u, forward, backward):
 
 
 @nb.njit(cache=True, parallel=True)
-def minus_laplacian(u, free, forward, backward, spacing, out):
-    """-Laplacian of u (per mm^2) over links at the free entries, 0 at the others, into out (E,)."""
-    for m in nb.prange(len(u)):
+def relax(u, free, forward, backward, spacing, tolerance, iterations):
+    """Make u (E,) float64 harmonic over links at the `free` entries (F,), the others fixed, in place.
+
+    Conjugate gradients on the 7-point Laplacian from u as it stands, until the residual has fallen by `tolerance` or
+    after `iterations`. Sums run over blocks of fixed size, whatever the number of threads.
+    """
+    blocks = (len(free) + BLOCK - 1) // BLOCK
+    residual, direction, image = np.zeros(len(u)), np.zeros(len(u)), np.zeros(len(u))
+    part = np.zeros(blocks)
+    w = (1 / spacing[0] ** 2, 1 / spacing[1] ** 2, 1 / spacing[2] ** 2)
+    for block in nb.prange(blocks):
         total = 0.0
-        if free[m]:
+        for k in range(block * BLOCK, min(len(free), (block + 1) * BLOCK)):
+            m = free[k]
+            pull = 0.0
             for a in range(3):
-                total += (2 * u[m] - u[forward[a, m]] - u[backward[a, m]]) / spacing[a] ** 2
-        out[m] = total
+                pull += w[a] * (u[forward[a, m]] + u[backward[a, m]] - 2 * u[m])
+            residual[m] = direction[m] = pull
+            total += pull * pull
+        part[block] = total
+    size = part.sum()
+    target = tolerance * tolerance * size
+    for _ in range(iterations):
+        if size <= target:
+            return
+        for block in nb.prange(blocks):
+            total = 0.0
+            for k in range(block * BLOCK, min(len(free), (block + 1) * BLOCK)):
+                m = free[k]
+                bend = 0.0
+                for a in range(3):
+                    bend += w[a] * (2 * direction[m] - direction[forward[a, m]] - direction[backward[a, m]])
+                image[m] = bend
+                total += bend * direction[m]
+            part[block] = total
+        stride = size / part.sum()
+        for block in nb.prange(blocks):
+            total = 0.0
+            for k in range(block * BLOCK, min(len(free), (block + 1) * BLOCK)):
+                m = free[k]
+                u[m] += stride * direction[m]
+                residual[m] -= stride * image[m]
+                total += residual[m] * residual[m]
+            part[block] = total
+        turn = part.sum() / size
+        size *= turn
+        for k in nb.prange(len(free)):
+            direction[free[k]] = residual[free[k]] + turn * direction[free[k]]

@@ -7,7 +7,7 @@ A query is a start entry and an offset from its voxel, in voxels; a stencil span
 import numba as nb
 import numpy as np
 
-from beltrami_cli.kernels import FAST
+from beltrami_cli.kernels import BLOCK, FAST
 
 
 @nb.njit(cache=True)
@@ -96,10 +96,9 @@ def cubic(u, origin, offset, forward, nodes, out):
     """
     f0, f1, f2 = forward[0], forward[1], forward[2]
     queries = len(origin)
-    block = 4096
-    for chunk in nb.prange((queries + block - 1) // block):
+    for chunk in nb.prange((queries + BLOCK - 1) // BLOCK):
         w0, w1, w2 = np.empty(4, u.dtype), np.empty(4, u.dtype), np.empty(4, u.dtype)
-        for m in range(chunk * block, min(queries, (chunk + 1) * block)):
+        for m in range(chunk * BLOCK, min(queries, (chunk + 1) * BLOCK)):
             x = origin[m]
             if x < 0:
                 continue

@@ -7,9 +7,7 @@ link pointing to the entry itself. Work is cut in blocks of fixed size, so sums 
 import numba as nb
 import numpy as np
 
-from beltrami_cli.kernels import FAST
-
-BLOCK = 4096  # entries: a block's arrays stay in a core's cache
+from beltrami_cli.kernels import BLOCK, FAST
 
 # Laws of the diffusivity c as a function of b = beta^2 |v|^2, with r = 1 / sqrt(1 + b).
 ONE, R, R2, R4, WEICKERT = 0, 1, 2, 3, 4
