@@ -22,7 +22,7 @@ class Band:
     first: (X + 1,) int32, entries of the box's voxel x are first[x] .. first[x + 1] - 1; the first one is primary.
     vertex: (E,) int32, the surface's vertex that the entry belongs to.
     normal: (3, E) float32, unit, along the voxel axes, at the closest point. distance: (E,) float32, signed, mm.
-    forward, backward: (3, E) int32, linked entries one voxel on along each axis; the entry itself where there is none.
+    forward, backward: (3, E) uint32, linked entries one voxel on along each axis; the entry itself where there is none.
     """
 
     grid: Grid
@@ -50,6 +50,11 @@ class Band:
         """(B,) int64: the entry of each band voxel's nearest sheet; what a volume shows."""
         starts = self.first[:-1]
         return starts[starts < self.first[1:]].astype(np.int64)
+
+    @property
+    def finest(self) -> float:
+        """The smallest voxel edge, mm, of the axes that have more than one voxel."""
+        return float(self.grid.spacing[np.array(self.grid.shape) > 1].min())
 
     @property
     def nodes(self) -> tuple[int, int, int]:
@@ -99,14 +104,15 @@ def build_band(psi: np.ndarray, grid: Grid, half_width: float) -> Band:
             sheets.best_matches(voxel, vertex, first, normal, shape, spacing, s.points, axis, move) for move in (1, -1)
         )
         forward[axis], backward[axis] = sheets.mutual_links(up, down)
-    return Band(grid, box, half_width, surface, voxel, first, vertex, normal, distance, forward, backward)
+    links = forward.view(np.uint32), backward.view(np.uint32)
+    return Band(grid, box, half_width, surface, voxel, first, vertex, normal, distance, *links)
 
 
 def flat_band(grid: Grid) -> Band:
     """Every voxel an entry, linked to its neighbours, and no normal: P = I, the flows of Eqs. 10-11."""
     count = int(np.prod(grid.shape))
-    ids = np.arange(count, dtype=np.int32).reshape(grid.shape)
-    forward, backward = np.empty((3, count), np.int32), np.empty((3, count), np.int32)
+    ids = np.arange(count, dtype=np.uint32).reshape(grid.shape)
+    forward, backward = np.empty((3, count), np.uint32), np.empty((3, count), np.uint32)
     for axis in range(3):
         rows = np.arange(grid.shape[axis])
         forward[axis] = ids.take(np.minimum(rows + 1, rows[-1]), axis).reshape(-1)
@@ -116,7 +122,7 @@ def flat_band(grid: Grid) -> Band:
         box=tuple(slice(0, n) for n in grid.shape),
         half_width=0.0,
         surface=None,
-        voxel=ids.reshape(-1),
+        voxel=np.arange(count, dtype=np.int32),
         first=np.arange(count + 1, dtype=np.int32),
         vertex=np.zeros(count, np.int32),
         normal=np.zeros((3, count), np.float32),

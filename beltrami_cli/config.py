@@ -18,6 +18,7 @@ from beltrami_cli.flows import FLOWS, PHI_LAWS, SCHEMES
 
 LAWS = ("linear", "geometric")
 DEFAULT_ITERATIONS = 20  # as in every example of the paper
+MOST_ITERATIONS = 10_000_000  # a typing error: days of work even on the smallest surface
 DEFAULT_BAND = 4.0  # half-width in voxels of the largest spacing: the local cubic's stencil is whole inside it
 FWHM_TO_TIME = 1 / (16 * math.log(2))  # heat flow for t mm^2 is a Gaussian of FWHM sqrt(16 ln 2 t) mm
 
@@ -63,7 +64,7 @@ def parse_beta(given: Any) -> Beta:
         law = None
         if isinstance(given, Mapping):
             rest = dict(given)
-            values, law = (float(rest.pop("start")), float(rest.pop("stop"))), str(rest.pop("law", "linear"))
+            values, law = _numbers([rest.pop("start"), rest.pop("stop")]), str(rest.pop("law", "linear"))
             if rest:
                 raise ValueError
         elif isinstance(given, str) and given.strip() == "auto":
@@ -182,10 +183,13 @@ class Settings:
     def duration(self, dt: float) -> tuple[int, float, str]:
         """(iterations, dt in mm^2, what ends the run); a given time is met exactly, by a dt no larger than given."""
         if self.time is None and self.fwhm is None:
-            return (DEFAULT_ITERATIONS if self.iterations is None else self.iterations), dt, "iterations"
+            iterations = DEFAULT_ITERATIONS if self.iterations is None else self.iterations
+            _require_countable("iterations", iterations)
+            return iterations, dt, "iterations"
         reason = "time" if self.fwhm is None else "fwhm"
-        total = self.time if self.fwhm is None else self.fwhm**2 * FWHM_TO_TIME
+        total = self.time if self.fwhm is None else self.fwhm * self.fwhm * FWHM_TO_TIME
         assert total is not None
+        _require_countable(reason, total / dt)
         iterations = math.ceil(total / dt - 1e-9)  # rounding must not add a step
         return iterations, (total / iterations if iterations else dt), reason
 
@@ -197,6 +201,13 @@ def _require_number(name: str, value: Any, least: float | None) -> None:
     if not number or (value < least if least is not None else value <= 0):
         wanted = "above 0" if least is None else f"of {least:g} or more"
         raise RefusedError(f"{name}: found {value!r}; expected a finite number {wanted}")
+
+
+def _require_countable(name: str, iterations: float) -> None:
+    if iterations > MOST_ITERATIONS:
+        raise RefusedError(
+            f"{name}: found {iterations:.4g} iterations; expected at most {MOST_ITERATIONS:.0e}: is it in mm^2 or mm?"
+        )
 
 
 @dataclass(frozen=True)
@@ -253,8 +264,10 @@ def read_config(path: Path) -> dict[str, Any]:
     for section, table in tables.items():
         if section == "for_each":
             raise RefusedError(f"{path}: has [for_each], which makes many runs; expected a config of one run")
-        if section not in KEYS or not isinstance(table, dict):
+        if section not in KEYS:
             raise RefusedError(f"{path}: unknown section [{section}]{_nearest(section, KEYS)}")
+        if not isinstance(table, dict):
+            raise RefusedError(f"{path}: found {section!r} as a key or a list; expected a section [{section}]")
         for key, value in table.items():
             if key not in KEYS[section]:
                 raise RefusedError(f"{path}: unknown key {key!r} in [{section}]{_nearest(key, KEYS[section])}")
@@ -293,6 +306,8 @@ def parse_spacing(given: Any) -> tuple[float, ...]:
 def _numbers(given: Any) -> tuple[float, ...]:
     """Numbers from "A,B,...", a list or one number; raises TypeError or ValueError for anything else."""
     parts = given.split(",") if isinstance(given, str) else given if isinstance(given, list | tuple) else [given]
+    if any(isinstance(part, bool) for part in parts):
+        raise TypeError("a truth value is no number")
     return tuple(float(part) for part in parts)
 
 

@@ -39,11 +39,12 @@ def run_demo(
 
     Raises RefusedError where outdir cannot be made, `source` holds no phantom, or outputs exist.
     """
+    given = _phantom_files(source) if source else None
     try:
         outdir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RefusedError(f"{outdir}: cannot be made ({error.strerror}); choose another OUTDIR") from error
-    levelset, clean, noisy = _phantom_files(source) if source else _make_torus(outdir, overwrite)
+    levelset, clean, noisy = given or _make_torus(outdir, overwrite)
     out, mesh, picture = (outdir / f"denoised{suffix}" for suffix in (".nii.gz", ".ply", ".png"))
     job = Job(noisy, out, levelset, (mesh,), overwrite=overwrite, settings=Settings(beta=BETA, iterations=ITERATIONS))
     drawn = find_spec("matplotlib") is not None

@@ -18,6 +18,9 @@ LEAST_WEIGHT = 0.125
 # Voxels to either side of the surface at which data are sampled: the two samples share no corner along the normal, and
 # lie within the voxels that the surface passes through or beside.
 HALF_STEP = 0.5
+# A voxel on one side of two banks belongs to the nearer one where it is nearer by this many voxels: less is within the
+# accuracy of a level set between two banks.
+MIDWAY = 0.5
 # Filling is a start for the flow: relative residual at which it stops, and the most iterations, each of which carries
 # the rim's values one voxel further in.
 FILL_TOLERANCE = 1e-3
@@ -67,9 +70,17 @@ def extend(band: Band, samples: np.ndarray, method: str = "closest-point") -> Ex
 
 
 def own_samples(band: Band, samples: np.ndarray) -> np.ndarray:
-    """(E,) samples at the entries that a voxel's data belong to, NaN at those of the banks behind the nearest."""
+    """(E,) samples at the entries that a voxel's data belong to; NaN at those of the banks behind the nearest.
+
+    A voxel midway between two banks feeds neither: which of them it shows is anyone's guess.
+    """
+    first = band.primary
+    second = np.minimum(first + 1, band.entries - 1)
+    shared = (band.voxel[second] == band.voxel[first]) & (second != first)
+    near, far = band.distance[first], band.distance[second]
+    contested = shared & (near * far > 0) & (np.abs(far) - np.abs(near) < MIDWAY * band.finest)
     own = np.full_like(samples, np.nan)
-    own[band.primary] = samples[band.primary]
+    own[first] = np.where(contested, np.nan, samples[first])
     return own
 
 
@@ -80,8 +91,7 @@ def at_closest_points(band: Band, own: np.ndarray) -> np.ndarray:
     depth, and with less noise than one sample at the point itself.
     """
     start = np.arange(band.entries, dtype=np.int32)
-    finest = band.grid.spacing[np.array(band.grid.shape) > 1].min()
-    aside = (HALF_STEP * finest * band.normal / band.grid.spacing[:, None]).astype(np.float32)
+    aside = (HALF_STEP * band.finest * band.normal / band.grid.spacing[:, None]).astype(np.float32)
     above, below = np.full_like(own, np.nan), np.full_like(own, np.nan)
     for out, offset in ((above, band.closest_offset + aside), (below, band.closest_offset - aside)):
         interpolate.linear(own, start, offset, band.forward, band.backward, LEAST_WEIGHT, out)
@@ -93,13 +103,12 @@ def at_closest_points(band: Band, own: np.ndarray) -> np.ndarray:
 def transported(band: Band, own: np.ndarray) -> np.ndarray:
     """(E,) solution of the initial value problem of Sec. 2.1, run for twice the time that a front takes to the rim."""
     spacing = band.grid.spacing
-    used = spacing[np.array(band.grid.shape) > 1]
-    dt = 0.9 / np.sqrt((1 / used**2).sum())  # mm at unit speed: the upwind scheme's own bound, with a margin
+    dt = 0.9 / np.sqrt(
+        (1 / spacing[np.array(band.grid.shape) > 1] ** 2).sum()
+    )  # mm at unit speed: the upwind scheme's own bound, with a margin
     u, out = own.copy(), np.empty_like(own)
     for _ in range(int(np.ceil(2 * band.half_width / dt))):
-        kernels.transport(
-            u, band.normal, band.distance, band.forward, band.backward, spacing, float(used.min()), dt, out
-        )
+        kernels.transport(u, band.normal, band.distance, band.forward, band.backward, spacing, band.finest, dt, out)
         u, out = out, u
     return u
 

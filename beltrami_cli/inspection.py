@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from beltrami_cli import formats
-from beltrami_cli.band import build_band
+from beltrami_cli.config import Settings
 from beltrami_cli.errors import BeltramiError, RefusedError
-from beltrami_cli.grid import require_same_grid
+from beltrami_cli.grid import Volume, require_same_grid
 from beltrami_cli.levelset import crossing_box
 from beltrami_cli.metrics import Difference, difference
+from beltrami_cli.solver import PlaneLast, Warnings, band_of, require_usable
 
 
 def compare_volumes(
@@ -33,12 +34,22 @@ def compare_volumes(
     if levelset is not None:
         psi = formats.read_volume(levelset)
         require_same_grid(first.grid, f"A {a}", psi.grid, f"PSI {levelset}")
-        if within is not None and not 0 < within < np.inf:
-            raise RefusedError(f"within: found {within:g}; expected a distance above 0 mm")
-        reach = 0.5 * float(psi.grid.spacing.max()) if within is None else within
-        band = build_band(psi.data, psi.grid, reach)
-        mask = np.nan_to_num(band.scatter(np.ones(band.entries, np.float32), 0.0)) > 0
+        mask = _near_surface(psi, f"PSI {levelset}", within)
     return difference(first.data, second.data, mask=mask, period=period, data_range=data_range)
+
+
+def _near_surface(psi: Volume, name: str, within: float | None) -> np.ndarray:
+    """True where a voxel lies within so many mm of the zero level of psi; None for half a voxel."""
+    if within is not None and not 0 < within < np.inf:
+        raise RefusedError(f"within: found {within:g}; expected a distance above 0 mm")
+    require_usable(psi.grid, name)
+    plane = PlaneLast(psi.grid)
+    widest = float(psi.grid.spacing[np.array(psi.grid.shape) > 1].max())
+    reach = 0.5 * widest if within is None else within
+    # Wider than what is looked at: a band's own rim is where the nearest vertex, not the surface, is in reach.
+    band = band_of(psi.data, Settings(band=reach + 1.5 * widest), plane, Warnings(None))
+    distance = plane.back(band.scatter(np.abs(band.distance), np.inf))
+    return np.asarray(distance <= reach)
 
 
 def describe_volume(path: Path) -> list[str]:

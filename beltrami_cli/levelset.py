@@ -93,8 +93,15 @@ def isosurface(psi: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Vertices (V, 3) in voxel indices and triangles (C, 3), facing increasing psi."""
     from skimage.measure import marching_cubes
 
+    mask = None
+    if not finite.all():
+        # The mask is asked at a cell's high corner only; a cell counts where all its corners are finite.
+        mask = np.zeros_like(finite)
+        corners = [finite[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None] for i, j, k in np.ndindex(2, 2, 2)]
+        mask[1:, 1:, 1:] = np.logical_and.reduce(corners)
+        psi = np.where(finite, psi, 1)
     try:
-        ijk, cells, _, _ = marching_cubes(psi, 0.0, mask=None if finite.all() else finite)
+        ijk, cells, _, _ = marching_cubes(psi, 0.0, mask=mask)
     except (ValueError, RuntimeError):  # no cell is crossed among the finite values
         return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
     return ijk.astype(np.float64), cells.astype(np.int32)
@@ -105,7 +112,7 @@ def contour(psi: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray
     from skimage.measure import find_contours
 
     points, segments, count = [], [], 0
-    for line in find_contours(psi[:, :, 0], 0.0, positive_orientation="low", mask=finite[:, :, 0]):
+    for line in find_contours(psi[:, :, 0], 0.0, positive_orientation="high", mask=finite[:, :, 0]):
         closed = len(line) > 2 and bool((line[0] == line[-1]).all())
         line = line[:-1] if closed else line
         index = np.arange(len(line))

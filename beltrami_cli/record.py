@@ -84,7 +84,7 @@ def sidecar(
         "Sources": [
             {"Path": os.fspath(path), "SHA256": digest} for path, digest in zip(job.inputs, hashes, strict=True)
         ],
-        "Outputs": [file.name for file in files],
+        "Outputs": [os.fspath(file) for file in files],
         "Created": datetime.now(UTC).isoformat(timespec="seconds"),
         **happened,
         "Files": {"resample": job.resample, "spacing": job.spacing},

@@ -181,7 +181,7 @@ def neighbours(cells) -> list[set[int]]:
 
 
 def closest_on_quadric(x, k1, k2):
-    """Closest point to x (3,) on z = -(k1 x^2 + k2 y^2) / 2, by Newton's method from the foot of x on the plane z = 0."""
+    """Closest point to x (3,) on z = -(k1 x^2 + k2 y^2) / 2, by Newton's method from the foot on the plane z = 0."""
     k, s = np.array([k1, k2]), np.array(x[:2], float)
     for _ in range(50):
         gap = x[2] + (k * s**2).sum() / 2

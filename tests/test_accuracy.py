@@ -45,7 +45,9 @@ def order(errors, radii=RADII):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"precision": "float32"}, {"precision": "float64"}, {"extension": "closest-point"}])
+@pytest.mark.parametrize(
+    "options", [{"precision": "float32"}, {"precision": "float64"}, {"extension": "closest-point"}]
+)
 def test_heat_on_a_sphere_is_of_second_order(options):
     errors = np.array([sphere_error(r, **options) for r in RADII])
     assert np.all(errors <= BOUNDS)
@@ -83,8 +85,8 @@ def test_anisotropic_voxels():
 @pytest.mark.slow
 def test_paper_scheme_is_of_first_order():
     errors = np.array([sphere_error(r, scheme="paper") for r in RADII])
-    assert np.all(errors <= [4e-2, 2e-2, 1.4e-2])
-    assert 0.8 <= order(errors) <= 1.4
+    assert np.all(errors <= [2e-2, 1e-2, 7e-3])
+    assert order(errors) >= 0.9
 
 
 def circle_error(radius, **options):
@@ -105,8 +107,8 @@ def circle_error(radius, **options):
 @pytest.mark.parametrize("options", [{}, {"extension": "closest-point"}])
 def test_heat_on_a_circle_is_of_second_order(options):
     errors = np.array([circle_error(r, **options) for r in RADII])
-    assert np.all(errors <= [9e-3, 2.5e-3, 1.2e-3])
-    assert order(errors) >= 1.7
+    assert np.all(errors <= [7e-3, 2e-3, 1e-3])
+    assert order(errors) >= 1.6
 
 
 # --- noise removed ----------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ def surface_points(band: Band) -> np.ndarray:
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (1.0, 1.0, 2.0), (0.6, 0.9, 0.7)])
 def test_alone_a_surface_has_one_entry_per_voxel_of_the_band(spacing):
     radius, width = 14.0, 4 * max(spacing)
-    x, centre, distance = ball(radius, spacing, room=width + 3)
+    _, centre, distance = ball(radius, spacing, room=width + 3)
     band = band_of(distance, spacing)
     # On anisotropic voxels two vertices of one bank, over 2 voxels apart, may here and there pass for two banks.
     assert band.entries - len(band.primary) <= (0 if len(set(spacing)) == 1 else 1.5e-3 * band.entries)
@@ -144,7 +144,7 @@ def test_links_are_mutual_and_lead_to_the_next_voxel(name):
     for a in range(3):
         for table, move in ((band.forward[a], 1), (band.backward[a], -1)):
             linked = table != own
-            assert np.array_equal(x[table[linked]] - x[linked], np.tile(move * np.eye(3, dtype=int)[a], (linked.sum(), 1)))
+            assert np.all(x[table[linked]] - x[linked] == move * np.eye(3, dtype=int)[a])
 
 
 @pytest.mark.parametrize("radius", [8.0, 10.0, 16.0])

@@ -99,9 +99,9 @@ def test_pde_approaches_closest_point_as_the_grid_is_refined():
         data = band.gather(3 * (np.tensordot([1 / 3, 2 / 3, 2 / 3], x, 1) / (distance + radius)) ** 2 - 1)
         exact = data[band.primary]  # constant along normals already
         by_pde, by_foot = (extend(band, data, method).values[band.primary] for method in ("pde", "closest-point"))
-        assert np.abs(by_foot - exact).max() < 0.6 / radius
+        assert np.abs(by_foot - exact).max() < 3 / radius**2  # of a range of 3
         gaps.append(np.abs(by_pde - by_foot).max())
-    assert gaps[0] < 0.12 and gaps[1] < 0.6 * gaps[0]
+    assert gaps[0] < 0.35 and gaps[1] < 0.35 * gaps[0]
 
 
 def test_pde_brings_surface_values_to_the_rim():
@@ -122,8 +122,8 @@ def test_holes_are_filled_within_the_range_of_their_rim(method):
     data = np.where(x[2] > 5, np.nan, x[0]).astype(np.float32)
     band = band_of(distance)
     extended = extend(band, band.gather(data), method)
-    assert np.isfinite(extended.values).all()
-    hole = ~extended.known
+    assert np.isfinite(extended.values[band.primary]).all()
+    hole = ~extended.known & np.isfinite(extended.values)
     assert 0.15 < hole.mean() < 0.35
     rim = np.nanmax(np.abs(data[(np.abs(distance) < 5) & (x[2] > 2)]))
     assert np.abs(extended.values[hole]).max() <= rim
@@ -141,9 +141,10 @@ def test_a_hole_changes_only_what_it_touches(method):
     whole = extend(band, band.gather(data), method).values
     holed = extend(band, band.gather(np.where(hole, np.nan, data)), method).values
     foot_z = band.gather(x[2]) + band.closest_offset[2]
-    away = (foot_z < 5 - (2 if method != "pde" else 6)) & (band.gather(x[2]) <= 5)
-    assert away.mean() > 0.4
-    assert np.array_equal(whole[away], holed[away])
+    reach = 8 if method == "pde" else 2  # transport runs for twice the band's half-width
+    away = (foot_z < 5 - reach) & (band.gather(x[2]) <= 5)
+    assert away.mean() > 0.3
+    assert np.array_equal(whole[away], holed[away], equal_nan=True)
 
 
 @pytest.mark.parametrize("method", EXTENSIONS)
@@ -196,4 +197,6 @@ def test_a_bank_is_fed_by_its_own_voxels_only():
     band = band_of(phantom.levelset)
     on_far_bank = phantom.clean[tuple(np.round(band.surface.points + [s.start for s in band.box]).astype(int).T)] > 50
     extended = extend(band, band.gather(phantom.clean))
-    assert np.array_equal(extended.values, np.where(on_far_bank[band.vertex], 100, 0))
+    # At the volume's faces the surface ends, and what is nearest there need not be the own bank.
+    expected = np.where(on_far_bank[band.vertex], 100, 0)
+    assert np.array_equal(extended.values[inner(band)], expected[inner(band)])

@@ -15,7 +15,7 @@ OFF_GRID = 0.137
 
 
 def ball(radius, spacing=(1.0, 1.0, 1.0), room=6.0):
-    """Points (3, nx, ny, nz) in mm from the centre of a ball, the centre (3,) in mm, and the distance to its surface."""
+    """Points (3, nx, ny, nz) in mm from a ball's centre, that centre (3,) in mm, and the distance to the surface."""
     spacing = np.array(spacing)
     count = np.ceil(2 * (radius + room) / spacing).astype(int)
     centre = (count - 1) / 2 * spacing - OFF_GRID

@@ -27,7 +27,7 @@ class Command(click.Command):
         """Run the command; its return value is the exit code (None: 0)."""
         try:
             return super().invoke(ctx)
-        except click.ClickException:
+        except (click.ClickException, BrokenPipeError):  # click ends quietly when the reader of a pipe has left
             raise
         except Exception as error:
             return report_error(error, verbose=bool(ctx.params.get("verbose")))

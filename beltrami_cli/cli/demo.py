@@ -27,7 +27,7 @@ def demo(outdir: Path, source: Path | None, overwrite: bool | None, quiet: bool,
     announce_compilation(quiet)
     with iteration_bar("flow", quiet=quiet) as observer:
         shown = run_demo(outdir, source, overwrite=bool(overwrite), observer=observer)
-    for line in summary(outdir, shown.record):
+    for line in summary(shown.record):
         say(quiet, line)
     say(quiet, f"PSNR on the surface: {shown.psnr_before:.1f} dB noisy, {shown.psnr_after:.1f} dB denoised")
     if shown.picture is None:

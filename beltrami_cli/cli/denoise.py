@@ -92,19 +92,21 @@ def denoise(inputs: tuple[Path, ...], config: Path | None, quiet: bool, verbose:
         result = run(job, observer=observer, notify=lambda line: note(quiet, f"warning: {line}"))
     if verbose:
         _tell_details(result.record)
-    for line in summary(job.volume.parent, result.record):
+    for line in summary(result.record):
         say(quiet, line)
     return 0
 
 
-def summary(folder: Path, record: dict[str, Any]) -> tuple[str, str]:
+def summary(record: dict[str, Any]) -> tuple[str, str]:
     """What was written, and what was done."""
-    names = [str(folder / name) for name in record["Outputs"]]
     removed = record["Removed"]["rms"]
     amount = "no noise measured" if removed is None else f"noise removed {removed:.4g} rms"
     seconds = sum(record["Seconds"].values())
     reason = f"stopped by {record['StopReason']}"
-    return f"wrote {', '.join(names)}", f"{amount}, {record['Iterations']} iterations, {reason}, {seconds:.1f} s"
+    return (
+        f"wrote {', '.join(record['Outputs'])}",
+        f"{amount}, {record['Iterations']} iterations, {reason}, {seconds:.1f} s",
+    )
 
 
 def _given(inputs: tuple[Path, ...], options: dict[str, Any]) -> dict[str, Any]:

@@ -38,6 +38,8 @@ def mesh(
     from beltrami_cli.config import parse_spacing
     from beltrami_cli.pipeline import mesh_of
 
+    if spacing and "NPY" not in [formats.volume_format(path) for path in (levelset, data) if path]:
+        raise click.UsageError("--spacing is for .npy inputs only; found none among LEVELSET and DATA; drop it")
     curve = 1 in formats.read_grid(levelset).shape
     files = formats.mesh_files(output, values=data is not None, curve=curve)
     with formats.Stage(files, overwrite=bool(overwrite), inputs=[p for p in (levelset, data) if p]) as stage:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 # Entries worked on at a time: their arrays stay in a core's cache, and sums over blocks of one size do not depend on
 # the number of threads.
-BLOCK = 4096
+BLOCK = 2048
 # What LLVM may assume: sums reordered, products fused, but NaN and infinity kept, for they mean "missing" here.
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
 

@@ -99,9 +99,9 @@ def cubic(u, origin, offset, forward, nodes, out):
     for chunk in nb.prange((queries + BLOCK - 1) // BLOCK):
         w0, w1, w2 = np.empty(4, u.dtype), np.empty(4, u.dtype), np.empty(4, u.dtype)
         for m in range(chunk * BLOCK, min(queries, (chunk + 1) * BLOCK)):
-            x = origin[m]
-            if x < 0:
+            if origin[m] < 0:
                 continue
+            x = np.uint32(origin[m])
             cubic_weights(offset[0, m] - np.floor(offset[0, m]), nodes[0], w0)
             cubic_weights(offset[1, m] - np.floor(offset[1, m]), nodes[1], w1)
             cubic_weights(offset[2, m] - np.floor(offset[2, m]), nodes[2], w2)
@@ -109,14 +109,15 @@ def cubic(u, origin, offset, forward, nodes, out):
             for a in range(nodes[0]):
                 y = x
                 for b in range(nodes[1]):
-                    z = y
-                    row = u[x] * 0
-                    inner = (nodes[0] == 1 or a == 1 or a == 2) and (nodes[1] == 1 or b == 1 or b == 2)
-                    for c in range(nodes[2]):
-                        row += w2[c] * u[z]
-                        if inner and (nodes[2] == 1 or c == 1 or c == 2):
-                            low, high = min(low, u[z]), max(high, u[z])
-                        z = f2[z]
+                    if nodes[2] == 1:
+                        row, least, most = u[y], u[y], u[y]
+                    else:
+                        z1 = f2[y]
+                        z2 = f2[z1]
+                        row = w2[0] * u[y] + w2[1] * u[z1] + w2[2] * u[z2] + w2[3] * u[f2[z2]]
+                        least, most = min(u[z1], u[z2]), max(u[z1], u[z2])
+                    if (nodes[0] == 1 or a == 1 or a == 2) and (nodes[1] == 1 or b == 1 or b == 2):
+                        low, high = min(low, least), max(high, most)
                     total += w0[a] * w1[b] * row
                     y = f1[y]
                 x = f0[x]

@@ -1,0 +1,308 @@
+"""Settings, TOML files and what the command line overrides."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command import ball, beltrami, contents, done, nifti, noisy, record, refused
+
+from beltrami_cli.config import Beta, Settings, make_job, overlaid, parse_beta, parse_spacing, read_config
+from beltrami_cli.errors import RefusedError
+
+FILES = """
+[input]
+levelset = "volumes/psi.nii.gz"
+data = "volumes/data.nii.gz"
+"""
+OUTPUT = """
+[output]
+volume = "out.nii.gz"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "volumes").mkdir()
+    nifti(tmp_path / "volumes" / "psi.nii.gz", ball())
+    nifti(tmp_path / "volumes" / "data.nii.gz", noisy())
+    return tmp_path
+
+
+def config(folder: Path, *sections: str) -> Path:
+    path = folder / "run.toml"
+    path.write_text("\n".join(sections), encoding="utf-8")
+    return path
+
+
+# Beta
+
+
+@pytest.mark.parametrize(
+    "given, expected",
+    [
+        (0.5, [0.5] * 6),
+        (0, [0] * 6),
+        ("0.5", [0.5] * 6),
+        (" 5e-1 ", [0.5] * 6),
+        ("1:6", [1, 2, 3, 4, 5, 6]),
+        ("6:1:linear", [6, 5, 4, 3, 2, 1]),
+        ("1:32:geometric", [1, 2, 4, 8, 16, 32]),
+        ("1,2,3", [1, 1, 2, 2, 3, 3]),
+        ([1, 2.5], [1, 1, 1, 2.5, 2.5, 2.5]),
+        ("1,2,3,4", [1, 1, 2, 3, 3, 4]),
+        ({"start": 1, "stop": 6}, [1, 2, 3, 4, 5, 6]),
+        ({"start": 1, "stop": 32, "law": "geometric"}, [1, 2, 4, 8, 16, 32]),
+    ],
+)
+def test_beta_over_six_iterations(given, expected):
+    beta = parse_beta(given)
+    assert beta.over(6) == pytest.approx(expected)
+    assert parse_beta(str(beta)).over(6) == pytest.approx(expected)
+    assert len(beta.over(0)) == 0
+
+
+def test_auto_beta():
+    assert parse_beta("auto") == Beta() == Settings().beta
+    assert parse_beta("auto").is_auto
+    assert str(Beta()) == "auto"
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        *["", "x", "1:", ":1", "1:2:3", "1:2:linear:2", "1;2", ",", "-1", "nan", "inf", "1,-2", "0:1:geometric"],
+        *[None, True, object(), [], ["x"], [1, False]],
+        *[{}, {"start": 1}, {"start": True, "stop": 2}, {"start": 1, "stop": 2, "step": 1}],
+    ],
+    ids=str,
+)
+def test_beta_that_makes_no_sense(given):
+    with pytest.raises(RefusedError, match="beta"):
+        parse_beta(given)
+
+
+# Settings
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"iterations": 2.5},
+        {"iterations": True},
+        {"iterations": -1},
+        {"iterations": "3"},
+        {"extend_every": 1.5},
+        {"threads": 0},
+        {"threads": False},
+        {"time": True},
+        {"time": -1.0},
+        {"time": float("inf")},
+        {"fwhm": "2"},
+        {"dt": 0.0},
+        {"band": -1},
+        {"eps": 0.0, "flow": "l1"},
+        {"flow": "heat"},
+        {"flow": None},
+        {"phi": "huber"},
+        {"scheme": "upwind"},
+        {"extension": ["none"]},
+        {"inside": 1},
+        {"outside": "blank"},
+        {"precision": 32},
+        {"iterations": 3, "time": 1.0},
+        {"flow": "l2", "beta": 0.1},
+        {"flow": "tv", "beta": 0.1},
+        {"eps": 1.0},
+        {"phi": "weickert"},
+        {"flat": True, "band": 4.0},
+    ],
+    ids=str,
+)
+def test_settings_that_make_no_sense(options):
+    with pytest.raises(RefusedError) as refusal:
+        Settings(**options)
+    assert "\n" not in str(refusal.value)
+    assert next(iter(options)) in str(refusal.value)
+
+
+def test_defaults_are_the_designs():
+    settings = Settings()
+    assert (settings.flow, settings.scheme, settings.extension) == ("beltrami", "symmetric", "closest-point")
+    assert (settings.outside, settings.inside, settings.precision) == ("nan", "negative", "float32")
+    assert settings.reextends_every == 5
+    assert settings.half_width(np.array([0.8, 0.8, 1.5])) == 6.0
+    assert settings.duration(0.15) == (20, 0.15, "iterations")
+    assert Settings(extension="none").reextends_every == 0
+    assert Settings(extension="none", extend_every=3).reextends_every == 3
+
+
+@pytest.mark.parametrize("total, iterations", [(0.0, 0), (0.15, 1), (0.1500001, 2), (1.5, 10), (0.01, 1)])
+def test_a_given_time_is_met_exactly(total, iterations):
+    count, dt, reason = Settings(time=total).duration(0.15)
+    assert (count, reason) == (iterations, "time")
+    assert dt <= 0.15 * (1 + 1e-9)
+    assert count * dt == pytest.approx(total)
+
+
+def test_spacing():
+    assert parse_spacing("2") == (2.0,)
+    assert parse_spacing("1,2,3") == parse_spacing([1, 2, 3]) == (1.0, 2.0, 3.0)
+    for wrong in ("", "x", "0", "-1", "nan", "1,2,3,4", [], True, None):
+        with pytest.raises(RefusedError, match="spacing"):
+            parse_spacing(wrong)
+
+
+# Files
+
+
+def test_config_alone(folder):
+    path = config(folder, FILES, OUTPUT, "[flow]\nbeta = 0.1", "[time]\niterations = 3", "[band]\nhalf_width = 3")
+    done("denoise", "--config", path)
+    used = record(folder / "out.json")
+    assert (used["Parameters"]["beta"], used["Parameters"]["band"], used["Iterations"]) == ("0.1", 3.0, 3)
+    assert (folder / "out.surf.gii").exists()
+
+
+def test_paths_are_relative_to_the_file_and_the_command_lines_to_where_it_runs(folder, monkeypatch):
+    elsewhere = folder / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    done("denoise", "--config", config(folder, FILES, OUTPUT), "--mesh", "here.ply")
+    assert set(contents(elsewhere)) == {"here.ply"}
+    assert (folder / "out.nii.gz").exists()
+    done("denoise", "--config", folder / "run.toml", "-o", "o.npy")
+    assert set(contents(elsewhere)) == {"here.ply", "o.npy", "o.ply", "o.json"}
+
+
+def test_command_line_wins(folder):
+    path = config(folder, FILES, OUTPUT, "[flow]\nbeta = 0.1\nscheme = 'paper'", "[time]\niterations = 3")
+    done("denoise", "--config", path, "--time", "0.3", "--beta", "0.2:0.4", "--no-mesh", "--outside", "zero")
+    used = record(folder / "out.json")
+    assert used["PerIteration"]["beta"] == pytest.approx([0.2, 0.4])
+    assert used["StopReason"] == "time"
+    assert (used["Parameters"]["scheme"], used["Parameters"]["outside"]) == ("paper", "zero")
+    assert not (folder / "out.surf.gii").exists()
+    other = nifti(folder / "other.nii.gz", noisy(seed=1))
+    done("denoise", other, "--config", path, "--overwrite")
+    assert record(folder / "out.json")["Sources"][1]["Path"] == str(other)
+
+
+@pytest.mark.parametrize(
+    "text, files",
+    [
+        ("mesh = false", set()),
+        ("mesh = []", set()),
+        ('mesh = "m.ply"', {"m.ply"}),
+        ('mesh = ["m.ply", "n.surf.gii"]', {"m.ply", "n.surf.gii", "n.func.gii"}),
+    ],
+)
+def test_meshes_of_a_config(folder, text, files):
+    before = set(contents(folder))
+    done("denoise", "--config", config(folder, FILES, OUTPUT, text))
+    assert set(contents(folder)) == {*before, *files, "run.toml", "out.nii.gz", "out.json"}
+
+
+def test_every_key_is_read(folder):
+    path = config(
+        folder,
+        '[input]\nlevelset = "a.npy"\ndata = "b.npy"\nspacing = [1, 2, 3]\nresample = true\ninside = "positive"',
+        '[output]\nvolume = "o.npy"\nmesh = "m.ply"\noutside = "keep"\noverwrite = true\nprecision = "float64"',
+        '[flow]\nname = "phi"\nphi = "weickert"\nscheme = "paper"\ndt = 0.05',
+        'beta = {start = 0.1, stop = 0.4, law = "geometric"}',
+        "[time]\nfwhm = 2.5",
+        '[band]\nhalf_width = 9\nextension = "pde"\nextend_every = 2',
+        "[run]\nthreads = 1",
+    )
+    job = make_job(read_config(path))
+    assert (job.levelset, job.data, job.volume) == (folder / "a.npy", folder / "b.npy", folder / "o.npy")
+    assert (job.spacing, job.resample, job.overwrite, job.mesh) == ((1.0, 2.0, 3.0), True, True, (folder / "m.ply",))
+    assert job.settings == Settings(
+        flow="phi", phi="weickert", beta=Beta((0.1, 0.4), "geometric"), scheme="paper", dt=0.05, fwhm=2.5, band=9,
+        extension="pde", extend_every=2, inside="positive", outside="keep", precision="float64", threads=1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("[flow]\nbetta = 1", ["'betta'", "[flow]", "'beta'"]),
+        ("[flwo]\nbeta = 1", ["[flwo]", "'flow'"]),
+        ("[band]\nextend-every = 1", ["'extend-every'", "'extend_every'"]),
+        ("[band]\nzzz = 1", ["'zzz'", "half_width, extension, extend_every"]),
+        ("[other]\nx = 1", ["[other]", "input, output, flow, time, band, run"]),
+        ("[[flow]]\nbeta = 1", ["'flow'", "section [flow]"]),
+        ("[for_each]\nsubject = ['01']", ["[for_each]", "one run"]),
+        ("[flow]\nbeta = 'x'", ["beta", "'x'"]),
+        ("[flow]\nbeta = true", ["beta", "True"]),
+        ("[flow]\nname = 3", ["flow", "3"]),
+        ("[flow]\ndt = 'fast'", ["dt", "'fast'"]),
+        ("[flow]\ndt = 1.0", ["dt", "0.166667"]),
+        ("[time]\niterations = 2.5", ["iterations", "2.5"]),
+        ("[time]\niterations = true", ["iterations", "True"]),
+        ("[time]\niterations = 3\ntime = 1", ["iterations and time"]),
+        ("[run]\nthreads = 0", ["threads", "0"]),
+        ("[band]\nhalf_width = '3 mm'", ["band", "'3 mm'"]),
+        ("[band]\nhalf_width = 1", ["band", "1.5"]),
+        ("[flow]\nflat = 'yes'", ["flat", "true or false"]),
+        ("[flow]\nflat = true", ["LEVELSET is omitted"]),
+        ("flow 3", ["not a valid TOML"]),
+        ("[input.more]\nx = 1", ["'more'", "[input]"]),
+    ],
+)
+def test_config_that_cannot_be(folder, text, words):
+    path = config(folder, FILES, OUTPUT, text)
+    before = contents(folder)
+    message = refused("denoise", "--config", path)
+    assert [word for word in words if word not in message] == []
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    "text, word",
+    [
+        ("volume = 3", "name of a file"),
+        ("volume = ''", "name of a file"),
+        ("volume = 'o.npy'\nmesh = 3", "name of a file"),
+        ("volume = 'o.npy'\nmesh = true", "name of a file"),
+        ("volume = 'o.npy'\nmesh = ['m.ply', 3]", "name of a file"),
+        ("volume = 'o.npy'\noverwrite = 1", "true or false"),
+        ("volume = 'o.npy'\noutside = ['nan']", "outside"),
+        ("mesh = false", "OUT"),
+    ],
+)
+def test_output_section_that_cannot_be(folder, text, word):
+    assert word in refused("denoise", "--config", config(folder, FILES, "[output]", text))
+
+
+def test_unreadable_config(folder):
+    assert "cannot be read" in refused("denoise", "--config", folder / "nothing.toml")
+    assert "cannot be read" in refused("denoise", "--config", folder)
+    (folder / "binary.toml").write_bytes(b"\xff\xfe\0")
+    assert "not a valid TOML" in refused("denoise", "--config", folder / "binary.toml")
+
+
+def test_config_names_its_file_where_a_section_is_wrong(folder):
+    path = config(folder, FILES, OUTPUT, "[flow]\nbetta = 1")
+    assert str(path) in refused("denoise", "--config", path)
+
+
+@pytest.mark.parametrize(
+    "base, over, expected",
+    [
+        ({"iterations": 3}, {"time": 1.0}, {"time": 1.0}),
+        ({"fwhm": 3}, {"iterations": 5}, {"iterations": 5}),
+        ({"fwhm": 3, "beta": 1}, {"beta": 2}, {"fwhm": 3, "beta": 2}),
+        ({"iterations": 3}, {}, {"iterations": 3}),
+    ],
+)
+def test_overlaid(base: dict[str, Any], over: dict[str, Any], expected: dict[str, Any]):
+    assert overlaid(base, over) == expected
+
+
+def test_flat_config(folder):
+    path = config(folder, '[input]\ndata = "volumes/data.nii.gz"', OUTPUT, "[flow]\nflat = true")
+    assert beltrami("denoise", "--config", path, "-q").code == 0
+    assert record(folder / "out.json")["Parameters"]["flat"] is True

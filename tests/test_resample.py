@@ -1,0 +1,73 @@
+"""Values brought onto another grid: by place in the world, with missing ones left out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from twins import TWINS, volume, voxels
+
+from beltrami_cli.grid import Grid, Volume
+from beltrami_cli.resample import resample
+
+
+def linear(ras_mm):
+    return ras_mm @ [3.0, -5.0, 7.0] + 2.0
+
+
+def linear_volume(grid, dtype=np.float64):
+    return Volume(linear(grid.to_world(voxels(grid))).reshape(grid.shape).astype(dtype), grid)
+
+
+@pytest.mark.parametrize("source", TWINS)
+@pytest.mark.parametrize("target", TWINS)
+def test_linear_fields_are_exact_between_any_two_grids(source, target):
+    got = resample(linear_volume(TWINS[source]), TWINS[target])
+    expected = linear_volume(TWINS[target]).data
+    inside = np.isfinite(got.data)
+    index = TWINS[source].to_index(TWINS[target].to_world(voxels(TWINS[target])))
+    last = np.array(TWINS[source].shape) - 1
+    within = np.all((index >= -1e-6) & (index <= last + 1e-6), axis=1).reshape(got.data.shape)
+    assert inside[within].all() and within.any()
+    assert np.abs(got.data - expected)[within].max() < 1e-9
+    assert got.grid is TWINS[target]
+
+
+def test_own_grid_gives_the_same_values():
+    given = volume(TWINS["oblique"])
+    got = resample(given, TWINS["oblique"])
+    assert np.allclose(got.data, given.data, rtol=1e-5)
+    assert got.data.dtype == given.data.dtype == np.float32
+
+
+def test_finer_grid_lies_between_the_voxels():
+    coarse = Volume(np.arange(8.0).reshape(2, 2, 2), Grid.from_spacing((2, 2, 2), 2.0))
+    fine = Grid((3, 3, 3), np.eye(4))
+    expected = np.arange(0, 2.5, 0.5)[None, None, [0, 1, 2]] + np.array([0, 2, 4.0])[:, None, None]
+    assert np.allclose(resample(coarse, fine).data, expected + np.array([0, 1, 2.0])[None, :, None])
+
+
+def test_outside_is_missing():
+    source = linear_volume(Grid.from_spacing((5, 5, 5)))
+    affine = np.eye(4)
+    affine[0, 3] = 3.0
+    got = resample(source, Grid((5, 5, 5), affine)).data
+    assert np.isfinite(got[:2]).all() and np.isnan(got[2:]).all()
+
+
+@pytest.mark.parametrize("garbage", [np.nan, np.inf, -np.inf])
+def test_missing_values_take_no_part(garbage):
+    data = np.full((6, 6, 6), 5.0)
+    data[2:4, 2:4, 2:4] = garbage
+    affine = np.eye(4)
+    affine[:3, 3] = 0.25
+    got = resample(Volume(data, Grid.from_spacing((6, 6, 6))), Grid((5, 5, 5), affine)).data
+    assert np.allclose(got[np.isfinite(got)], 5.0)
+    assert np.isnan(got[2, 2, 2]) and np.isfinite(got[1, 1, 1])  # all, and one in 64, of the weight on the hole
+
+
+def test_planes():
+    image = Volume(np.arange(12.0).reshape(4, 3, 1), Grid.from_spacing((4, 3)))
+    affine = np.eye(4)
+    affine[0, 3] = 0.5
+    got = resample(image, Grid((3, 3, 1), affine)).data
+    assert np.allclose(got[:, :, 0], image.data[:3, :, 0] + 1.5)
