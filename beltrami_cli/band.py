@@ -98,6 +98,7 @@ def build_band(psi: np.ndarray, grid: Grid, half_width: float) -> Band:
     normal, distance = sheets.closest_points(
         voxel, vertex, shape, spacing, s.points, s.normals, s.curvature, s.direction
     )
+    normal[np.array(shape) == 1] = 0  # in a plane, exactly: a closest point 1e-19 below it would lie in no cell
     forward, backward = np.empty((3, len(voxel)), np.int32), np.empty((3, len(voxel)), np.int32)
     for axis in range(3):
         up, down = (

@@ -47,17 +47,14 @@ def extend(band: Band, samples: np.ndarray, method: str = "closest-point") -> Ex
     nearest take the closest point's). Holes are then filled from the band around them.
     Raises DataError where no entry is reached by valid data.
     """
-    own = own_samples(band, samples)
     if band.surface is None:
-        values = own
+        values = samples.copy()
     elif method == "pde":
-        values = transported(band, own)
+        values = transported(band, own_samples(band, samples))
     else:
-        values = own.copy() if method == "none" else np.full_like(own, np.nan)
-        secondary = np.ones(band.entries, bool)
-        secondary[band.primary] = method != "none"
-        nearest = at_closest_points(band, own)
-        values[secondary] = nearest[secondary]
+        values = at_closest_points(band, own_samples(band, samples))
+        if method == "none":
+            values[band.primary] = samples[band.primary]
     known = ~np.isnan(values)
     if not known.any():
         raise DataError(

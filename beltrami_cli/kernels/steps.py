@@ -2,8 +2,8 @@
 
 Arrays run over the band's E entries: u (E,), normal (3, E), forward and backward (3, E) neighbour entries, a missing
 link pointing to the entry itself. Loops are cut where a gather or a choice of law would keep one from vectorising, and
-run block by block, so that what one loop leaves the next finds in the cache. Indices are unsigned, for numba tests every
-signed one for being negative.
+run block by block, so that what one loop leaves the next finds in the cache. Indices are unsigned, for numba tests
+every signed one for being negative.
 """
 
 import numba as nb
