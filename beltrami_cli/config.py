@@ -7,6 +7,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +139,7 @@ class Settings:
             _require_number(name, getattr(self, name), least)
         for name, lowest in (("iterations", 0), ("extend_every", 0), ("threads", 1)):
             value = getattr(self, name)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < lowest):
+            if value is not None and (isinstance(value, bool) or not isinstance(value, Integral) or value < lowest):
                 raise RefusedError(f"{name}: found {value!r}; expected a whole number of {lowest} or more")
         self._require_sensible_combination()
 
@@ -197,7 +198,7 @@ class Settings:
 def _require_number(name: str, value: Any, least: float | None) -> None:
     if value is None:
         return
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
     if not number or (value < least if least is not None else value <= 0):
         wanted = "above 0" if least is None else f"of {least:g} or more"
         raise RefusedError(f"{name}: found {value!r}; expected a finite number {wanted}")

@@ -44,8 +44,9 @@ def run_demo(
         outdir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RefusedError(f"{outdir}: cannot be made ({error.strerror}); choose another OUTDIR") from error
+    out, mesh, picture, sidecar = (outdir / f"denoised{suffix}" for suffix in (".nii.gz", ".ply", ".png", ".json"))
+    formats.Stage([out, mesh, picture, sidecar], overwrite=overwrite)  # refuses before anything is made
     levelset, clean, noisy = given or _make_torus(outdir, overwrite)
-    out, mesh, picture = (outdir / f"denoised{suffix}" for suffix in (".nii.gz", ".ply", ".png"))
     job = Job(noisy, out, levelset, (mesh,), overwrite=overwrite, settings=Settings(beta=BETA, iterations=ITERATIONS))
     drawn = find_spec("matplotlib") is not None
     with formats.Stage([picture] if drawn else [], overwrite=overwrite) as stage:

@@ -92,7 +92,7 @@ def typical_slope(band: Band, u: np.ndarray, known: np.ndarray) -> float:
 
     u: (E,), known: (E,) bool. With noisy data this is the slope of the noise: what lies above it is an edge.
     """
-    h = band.grid.spacing.astype(np.float32)
+    h, u = band.grid.spacing, u.astype(np.float64)  # whose squares neither overflow nor vanish
     gradient = np.stack([(u[band.forward[a]] - u[band.backward[a]]) / (2 * h[a]) for a in range(3)])
     gradient -= (gradient * band.normal).sum(0) * band.normal
     return float(np.median(np.sqrt((gradient[:, known] ** 2).sum(0))))

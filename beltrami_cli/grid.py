@@ -79,12 +79,12 @@ class Grid:
         return f"{' x '.join(map(str, self.shape))} voxels of {steps} mm, affine [{rows}]"
 
 
-def require_same_grid(first: Grid, first_name: str, second: Grid, second_name: str) -> None:
-    """Raise RefusedError, with both grids printed below the message, unless the two grids match."""
+def require_same_grid(first: Grid, first_name: str, second: Grid, second_name: str, *, remedy: str) -> None:
+    """Raise RefusedError, with the remedy and both grids printed below it, unless the two grids match."""
     if not first.matches(second):
         raise RefusedError(
             f"grids differ: {second_name} does not lie on the grid of {first_name}; "
-            "expected one grid for both (--resample brings DATA onto the level set's grid)\n"
+            f"expected one grid for both ({remedy})\n"
             f"  {first_name}: {first.describe()}\n  {second_name}: {second.describe()}"
         )
 

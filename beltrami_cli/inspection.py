@@ -14,6 +14,8 @@ from beltrami_cli.levelset import crossing_box
 from beltrami_cli.metrics import Difference, difference
 from beltrami_cli.solver import PlaneLast, Warnings, band_of, require_usable
 
+REMEDY = "bring them onto one grid first, for example with denoise --resample"
+
 
 def compare_volumes(
     a: Path,
@@ -29,11 +31,11 @@ def compare_volumes(
     Raises RefusedError where the grids differ, DataError where nothing can be compared.
     """
     first, second = formats.read_volume(a, dtype=np.float64), formats.read_volume(b, dtype=np.float64)
-    require_same_grid(first.grid, f"A {a}", second.grid, f"B {b}")
+    require_same_grid(first.grid, f"A {a}", second.grid, f"B {b}", remedy=REMEDY)
     mask = None
     if levelset is not None:
         psi = formats.read_volume(levelset)
-        require_same_grid(first.grid, f"A {a}", psi.grid, f"PSI {levelset}")
+        require_same_grid(first.grid, f"A {a}", psi.grid, f"PSI {levelset}", remedy=REMEDY)
         mask = _near_surface(psi, f"PSI {levelset}", within)
     return difference(first.data, second.data, mask=mask, period=period, data_range=data_range)
 

@@ -9,8 +9,9 @@ import numpy as np
 from beltrami_cli.errors import DataError
 from beltrami_cli.kernels import mesh as kernels
 
-# Psi of exactly 0 at a node would make triangles without area: it is moved off by this share of the largest |Psi|.
-NUDGE = 1e-6
+# Makes a thin voxel's value outweigh any other: of two pairs of fourth roots, the thin one has the larger product even
+# where its values are a million times smaller.
+THIN_WEIGHT = np.float32(8)
 # Least squares for curvature: rings smaller than this, in voxels, say little about it.
 RING_VOXELS = 0.3
 
@@ -70,12 +71,10 @@ def zero_surface(psi: np.ndarray, spacing: np.ndarray) -> ZeroSurface:
     psi: (nx, ny, nz), NaN or inf where unknown. spacing: (3,) mm. Raises DataError where nothing is crossed.
     """
     psi = np.ascontiguousarray(psi, np.float32)
-    finite = np.isfinite(psi)
-    scale = np.abs(psi, where=finite, out=np.zeros_like(psi)).max()
-    psi = np.where(np.abs(psi) < NUDGE * scale, np.float32(NUDGE * scale), psi)
-    ijk, cells = (contour if psi.shape[2] == 1 else isosurface)(psi, finite)
+    ijk, cells = (contour if psi.shape[2] == 1 else isosurface)(thin_first(psi), np.isfinite(psi))
     if not len(cells):
         raise DataError("the level set has no zero level among its finite values")
+    ijk = kernels.linear_crossings(psi, ijk)
     points = ijk * spacing
     start, ring = kernels.half_edges(cells, len(points))
     raw = kernels.segment_normals(points, cells) if cells.shape[1] == 2 else kernels.face_normals(points, cells)
@@ -87,6 +86,25 @@ def zero_surface(psi: np.ndarray, spacing: np.ndarray) -> ZeroSurface:
         points, normals, start, ring, 1 / voxel, (RING_VOXELS * voxel) ** 2
     )
     return ZeroSurface(points, cells, normals, curvature, direction, start, ring)
+
+
+def thin_first(psi: np.ndarray) -> np.ndarray:
+    """Psi's signs with sizes that say what is connected to what, not where the surface is.
+
+    Where two corners of a cell's face are inside and the other two outside, marching cubes connects the pair of the
+    larger values. In a sulcus or a blade about one voxel thick the samples do not tell which pair that is, and the
+    wrong one pierces it. Voxels between two of the other sign are therefore made to win.
+    """
+    negative = psi < 0
+    thin = np.zeros(psi.shape, bool)
+    for axis in range(3):
+        before, here, after = (
+            tuple(part if k == axis else slice(None) for k in range(3))
+            for part in (slice(None, -2), slice(1, -1), slice(2, None))
+        )
+        thin[here] |= (negative[before] == negative[after]) & (negative[before] != negative[here])
+    size = np.sqrt(np.sqrt(np.maximum(np.abs(psi), np.finfo(np.float32).tiny)))
+    return np.copysign(np.where(thin, THIN_WEIGHT * size, size), psi)
 
 
 def isosurface(psi: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from beltrami_cli import formats
 from beltrami_cli.config import Job, Settings
-from beltrami_cli.errors import RefusedError
+from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import own_samples
 from beltrami_cli.grid import Grid, Volume, require_same_grid
@@ -23,6 +23,8 @@ from beltrami_cli.resample import resample
 from beltrami_cli.sampling import surface_mesh
 from beltrami_cli.solver import PlaneLast, Result, Warnings, band_of, require_usable, solve, time_step
 from beltrami_cli.surface import Mesh
+
+REMEDY = "--resample brings DATA onto the level set's grid"
 
 
 def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], None] | None = None) -> Result:
@@ -75,8 +77,11 @@ def mesh_of(
     volume = formats.read_volume(data, spacing=_spacing_for(data, spacing))
     if bring:
         volume = resample(volume, psi.grid)
-    require_same_grid(psi.grid, f"LEVELSET {levelset}", volume.grid, f"DATA {data}")
-    return surface_mesh(band, own_samples(band, band.gather(plane.forth(volume.data))))
+    require_same_grid(psi.grid, f"LEVELSET {levelset}", volume.grid, f"DATA {data}", remedy=REMEDY)
+    mesh = surface_mesh(band, own_samples(band, band.gather(plane.forth(volume.data))))
+    if mesh.values is not None and not np.isfinite(mesh.values).any():
+        raise DataError(f"DATA {data} has no value on the surface: found only NaN there; drop it for a bare mesh")
+    return mesh
 
 
 class _Files:
@@ -101,7 +106,7 @@ def _check_grids(job: Job) -> Grid:
         raise RefusedError("spacing: is for .npy inputs only; found none among LEVELSET and DATA; drop --spacing")
     grid = grids[job.inputs[0]]
     if job.levelset is not None and not job.resample:
-        require_same_grid(grid, f"LEVELSET {job.levelset}", grids[job.data], f"DATA {job.data}")
+        require_same_grid(grid, f"LEVELSET {job.levelset}", grids[job.data], f"DATA {job.data}", remedy=REMEDY)
     require_usable(grid, str(job.inputs[0]))
     time_step(grid, job.settings)
     if not job.settings.flat:
@@ -125,6 +130,11 @@ def _read(job: Job) -> tuple[Volume, Volume | None]:
     psi = read(job.levelset)
     if job.resample and not data.grid.matches(psi.grid):
         data = replace(resample(data, psi.grid), file_shape=psi.file_shape, header=psi.header)
+        if not np.isfinite(data.data).any():
+            raise DataError(
+                f"{job.data}: has no value on the grid of {job.levelset}: found no overlap in world space, "
+                "expected volumes of one head in one space"
+            )
     elif formats.volume_format(job.volume) != formats.volume_format(job.data):
         data = replace(data, header=psi.header)
     return data, psi

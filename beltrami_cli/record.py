@@ -37,6 +37,7 @@ def what_happened(
     removed = removed[np.isfinite(removed)]
     used = {**asdict(settings), "beta": str(settings.beta), "band": band.half_width, "dt": schedule.dt}
     used["extend_every"] = settings.reextends_every
+    used["iterations"] = schedule.iterations
     used["threads"] = numba.get_num_threads()
     used["eps"] = 1 / schedule.beta[0] if settings.flow in ("l1", "tv") and schedule.beta.any() else None
     used["phi"] = settings.phi_name if settings.flow == "phi" else None

@@ -11,10 +11,10 @@ import numba
 import numpy as np
 
 from beltrami_cli.band import Band, build_band, flat_band
-from beltrami_cli.config import Settings
-from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.config import Settings, parse_spacing
+from beltrami_cli.errors import DataError, NumericsError, RefusedError
 from beltrami_cli.evolve import Observer, Schedule, evolve
-from beltrami_cli.extension import Reextension, extend
+from beltrami_cli.extension import Extended, Reextension, extend
 from beltrami_cli.flows import DT_SHARE, Flow, stability_bound, typical_slope
 from beltrami_cli.grid import Grid
 from beltrami_cli.progress import Phases
@@ -71,6 +71,8 @@ def denoise(
     except TypeError as error:
         name = str(error).rsplit(" ", 1)[-1]
         raise RefusedError(f"unknown option {name}; the options are the fields of config.Settings") from None
+    if isinstance(data, np.ma.MaskedArray):
+        data = np.ma.filled(data.astype(float), np.nan)
     values = np.asarray(data)
     if values.ndim not in (2, 3):
         raise RefusedError(f"data: found an array of shape {values.shape}; expected 2 or 3 axes")
@@ -81,16 +83,25 @@ def denoise(
         raise RefusedError(f"levelset has shape {psi.shape} and data {values.shape}; expected one shape for both")
     if settings.flat != (psi is None):
         raise RefusedError("levelset: expected an array, or None together with flat=True")
-    steps = spacing if spacing is None or np.isscalar(spacing) else tuple(spacing)  # type: ignore[arg-type]
-    grid = Grid.from_spacing(values.shape, 1.0 if steps is None else steps)  # type: ignore[arg-type]
-    if affine is not None:
-        grid = Grid(grid.shape, np.asarray(affine, float))
+    grid = _grid(values.shape, affine, spacing)
     solved = solve(
         None if psi is None else _as_float(psi, settings).reshape(grid.shape),
         _as_float(values, settings).reshape(grid.shape),
         grid, settings, Phases(), observer,
     )  # fmt: skip
     return replace(solved, data=solved.data.reshape(values.shape))
+
+
+def _grid(shape: tuple[int, ...], affine: np.ndarray | None, spacing: float | Sequence[float] | None) -> Grid:
+    """The grid of an array; raises RefusedError where affine or spacing cannot place voxels."""
+    if affine is None:
+        steps = (1.0,) if spacing is None else parse_spacing(spacing if np.isscalar(spacing) else list(spacing))  # type: ignore[arg-type]
+        return Grid.from_spacing(shape, steps[0] if len(steps) == 1 else steps)
+    matrix = np.asarray(affine)
+    usable = matrix.shape == (4, 4) and matrix.dtype.kind in "fiu" and np.isfinite(matrix).all()
+    if not usable or np.linalg.det(matrix[:3, :3]) == 0:
+        raise RefusedError(f"affine: found {matrix.tolist()}; expected an invertible 4 x 4 matrix, voxels to RAS mm")
+    return Grid(Grid.from_spacing(shape).shape, matrix.astype(float))
 
 
 def solve(
@@ -127,12 +138,13 @@ def solve(
         evolution = evolve(
             u0, flow.stepper(band, u0.dtype), schedule, Reextension(band) if every else None, every, observer
         )
-        values = np.where(np.isnan(start.values), np.nan, evolution.values)
+        values, excess = _within_range(np.where(np.isnan(start.values), np.nan, evolution.values), start)
     with phases("mesh"):
         mesh = None if settings.flat else surface_mesh(band, values)
     outside: dict[str, np.ndarray | float] = {"nan": np.nan, "zero": 0.0, "keep": plane.forth(data)}
     out = plane.back(band.scatter(values, outside[settings.outside]))
     record = what_happened(settings, grid, band, schedule, evolution, slope, samples, values, start.known)
+    record["ClippedExcess"] = excess
     return Result(out, mesh, record, tuple(warnings.lines))
 
 
@@ -161,12 +173,31 @@ def _signed(psi: np.ndarray, settings: Settings, warnings: Warnings) -> np.ndarr
 def _finite_or_missing(data: np.ndarray, warnings: Warnings) -> np.ndarray:
     """Data whose infinite values are missing too; raises DataError where nothing is left."""
     infinite = np.isinf(data)
+    if not np.isfinite(data).any():
+        found = "NaN and values that are infinite at this precision" if infinite.any() else "NaN"
+        raise DataError(f"DATA has no valid value: found only {found}; expected finite values on the surface")
     if infinite.any():
         warnings.add(f"DATA has {int(infinite.sum())} infinite values: taken as missing")
         data = np.where(infinite, np.nan, data)
-    if np.isnan(data).all():
-        raise DataError("DATA has no valid value: found only NaN; expected finite values on the surface")
     return data
+
+
+def _within_range(values: np.ndarray, start: Extended) -> tuple[np.ndarray, float]:
+    """Values (E,), NaN where missing, kept within the data's range, and by how much they had left it (data units).
+
+    No flow leaves the range; differences do, a little, beside the band's ragged rim. Raises NumericsError where it was
+    more than the range's own width: no error of differences, but a runaway.
+    """
+    data = start.values[start.known].astype(float)
+    low, high = data.min(), data.max()
+    excess = max(low - float(np.nanmin(values)), float(np.nanmax(values)) - high, 0.0)
+    rounding = np.finfo(values.dtype).eps * len(values) * max(abs(low), abs(high))
+    if not excess <= high - low + rounding:
+        raise NumericsError(
+            f"the flow ran away: found values {excess:.6g} beyond the data's own {low:.6g} to {high:.6g}; "
+            "try a smaller --dt or --scheme symmetric"
+        )
+    return np.clip(values, low, high).astype(values.dtype), excess
 
 
 def _schedule(settings: Settings, dt: float, slope: float) -> Schedule:

@@ -124,14 +124,12 @@ PLACES = [
 ]  # fmt: skip
 
 
-@pytest.mark.xfail(reason="places that cannot be are not checked on arrays", strict=True)
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: f"{place}".replace("\n", ""))
 def test_places_that_cannot_be(place):
     with pytest.raises(BeltramiError):
         denoise(ball(), noisy(), **place)
 
 
-@pytest.mark.xfail(reason="the mask of a masked array is dropped", strict=True)
 def test_masked_values_are_missing():
     values = noisy()
     hidden = values > 60

@@ -60,7 +60,7 @@ def test_grids_match_within_the_rounding_of_a_header():
 
 def test_refusal_prints_both_grids():
     with pytest.raises(RefusedError) as refusal:
-        require_same_grid(TWINS["RAS"], "psi.nii", TWINS["LAS"], "data.nii")
+        require_same_grid(TWINS["RAS"], "psi.nii", TWINS["LAS"], "data.nii", remedy="resample it")
     first, *grids = str(refusal.value).splitlines()
     assert "data.nii does not lie on the grid of psi.nii" in first
     assert "--resample" in first

@@ -56,7 +56,6 @@ def test_parameters_as_used(scene, tmp_path):
     assert 1 <= used["threads"] <= (os.cpu_count() or 1)
 
 
-@pytest.mark.xfail(strict=True, reason="the default number of iterations is left out of the parameters")
 def test_default_iterations_are_a_parameter_as_used(scene, tmp_path):
     levelset, data, out = scene
     done("denoise", levelset, data, "-o", out)

@@ -194,7 +194,7 @@ def write_mesh(path: Path, mesh: Mesh) -> list[Path]:
 
 def _by_suffix(path: Path, known: dict[str, str], what: str) -> str:
     for suffix, kind in known.items():
-        if path.name.lower().endswith(suffix):
+        if path.name.lower().endswith(suffix) and len(path.name) > len(suffix):
             return kind
     raise RefusedError(f"{path}: not the suffix of a {what}; expected one of {' '.join(known)}")
 

@@ -3,7 +3,7 @@
 import numba as nb
 import numpy as np
 
-from beltrami_cli.kernels import BLOCK
+from beltrami_cli.kernels import BLOCK, total
 
 
 @nb.njit(cache=True, parallel=True)
@@ -74,40 +74,40 @@ def relax(u, free, forward, backward, spacing, tolerance, iterations):
     part = np.zeros(blocks)
     w = (1 / spacing[0] ** 2, 1 / spacing[1] ** 2, 1 / spacing[2] ** 2)
     for block in nb.prange(blocks):
-        total = 0.0
+        share = 0.0
         for k in range(block * BLOCK, min(len(free), (block + 1) * BLOCK)):
             m = free[k]
             pull = 0.0
             for a in range(3):
                 pull += w[a] * (u[forward[a, m]] + u[backward[a, m]] - 2 * u[m])
             residual[m] = direction[m] = pull
-            total += pull * pull
-        part[block] = total
-    size = part.sum()
+            share += pull * pull
+        part[block] = share
+    size = total(part)
     target = tolerance * tolerance * size
     for _ in range(iterations):
         if size <= target:
             return
         for block in nb.prange(blocks):
-            total = 0.0
+            share = 0.0
             for k in range(block * BLOCK, min(len(free), (block + 1) * BLOCK)):
                 m = free[k]
                 bend = 0.0
                 for a in range(3):
                     bend += w[a] * (2 * direction[m] - direction[forward[a, m]] - direction[backward[a, m]])
                 image[m] = bend
-                total += bend * direction[m]
-            part[block] = total
-        stride = size / part.sum()
+                share += bend * direction[m]
+            part[block] = share
+        stride = size / total(part)
         for block in nb.prange(blocks):
-            total = 0.0
+            share = 0.0
             for k in range(block * BLOCK, min(len(free), (block + 1) * BLOCK)):
                 m = free[k]
                 u[m] += stride * direction[m]
                 residual[m] -= stride * image[m]
-                total += residual[m] * residual[m]
-            part[block] = total
-        turn = part.sum() / size
+                share += residual[m] * residual[m]
+            part[block] = share
+        turn = total(part) / size
         size *= turn
         for k in nb.prange(len(free)):
             direction[free[k]] = residual[free[k]] + turn * direction[free[k]]

@@ -9,6 +9,8 @@ import numpy as np
 # Psi counts as smooth at a crossing when its second differences along the edge stay below this share of its slope: the
 # distance to a sphere of 4 voxels' radius reaches 0.25; a clamp, a mask or the ridge between two banks 0.5 and more.
 SMOOTH = 0.3
+# Least distance of a crossing from the ends of its grid edge, in voxels: far below what a level set resolves.
+EDGE = 1e-4
 
 
 @nb.njit(cache=True)
@@ -122,6 +124,25 @@ def edge_of(ijk, low):
 
 
 @nb.njit(cache=True)
+def linear_crossings(psi, ijk):
+    """Crossings (V, 3), each known to lie on a grid edge, at the zero of Psi's straight line along it.
+
+    Kept off the nodes by EDGE, lest triangles lose their area where Psi is exactly 0 at a node.
+    """
+    points = np.empty_like(ijk)
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for v in range(len(ijk)):
+        axis = edge_of(ijk[v], low)
+        high[:] = low
+        high[axis] += 1
+        before, after = psi[low[0], low[1], low[2]], psi[high[0], high[1], high[2]]
+        for a in range(3):
+            points[v, a] = low[a]
+        points[v, axis] += min(max(before / (before - after), EDGE), 1 - EDGE)
+    return points
+
+
+@nb.njit(cache=True)
 def gradient_on_edge(psi, low, axis, line, t, spacing, gradient):
     """Gradient of Psi (per mm) at t along the edge from node `low`, into gradient (3,); False where a neighbour lacks.
 
@@ -171,7 +192,7 @@ def refine_crossings(psi, ijk, spacing, mesh_normals):
         size = np.sqrt((gradient**2).sum())
         bend = max(abs(line[0] - 2 * line[1] + line[2]), abs(line[1] - 2 * line[2] + line[3]))
         if bend <= SMOOTH * size * spacing[axis] and (gradient * mesh_normals[v]).sum() > 0.9 * size:
-            points[v, axis] = low[axis] + t
+            points[v, axis] = low[axis] + min(max(t, EDGE), 1 - EDGE)
             normals[v] = gradient / size
     return points, normals
 

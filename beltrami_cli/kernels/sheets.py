@@ -15,7 +15,7 @@ TWIN_COSINE = 0.34
 ASIDE = 0.66
 # Neighbouring entries are of one bank when their vertices are within 2.5 voxels and their normals are not opposed.
 LINK_VOXELS = 2.5
-LINK_COSINE = -0.5
+LINK_COSINE = 0.0
 
 
 @nb.njit(cache=True, inline="always")
@@ -104,21 +104,23 @@ def grow(shape, spacing, points, normals, start, ring, half_width):
             if i < 0 or j < 0 or k < 0 or i >= shape[0] or j >= shape[1] or k >= shape[2]:
                 continue
             x = i * stride[0] + j * stride[1] + k
+            x0, x1, x2 = i * spacing[0], j * spacing[1], k * spacing[2]
             known = False
             e = head[x]
             while e >= 0:
                 w = vertex[e]
+                # A sheet that is there already, by a vertex that v does not better.
                 if w == v or (
                     tries == 6
                     and squared_voxels(points, v, w, per_voxel) < TWIN_VOXELS**2
                     and cosine(normals, v, w) > TWIN_COSINE
+                    and squared_distance(points, v, x0, x1, x2) >= distance[e]
                 ):
                     known = True
                     break
                 e = after[e]
             if known:
                 continue
-            x0, x1, x2 = i * spacing[0], j * spacing[1], k * spacing[2]
             w, d = descend(points, start, ring, v, x0, x1, x2)
             if d > reach:
                 continue

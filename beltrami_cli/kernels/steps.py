@@ -9,7 +9,7 @@ every signed one for being negative.
 import numba as nb
 import numpy as np
 
-from beltrami_cli.kernels import BLOCK, FAST
+from beltrami_cli.kernels import BLOCK, FAST, total
 
 # Laws of the diffusivity c as a function of b = beta^2 |v|^2, with r = 1 / sqrt(1 + b).
 ONE, R, R2, R4, WEICKERT = 0, 1, 2, 3, 4
@@ -23,16 +23,16 @@ def diffuse(law, b2, c, form, w0, w1, w2, low, high):
     Returns the sum of c form. One loop for each law, so that each vectorises.
     """
     one = c.dtype.type(1)
-    total = one * 0
+    form_sum = one * 0
     if law == R:  # by far the most used, so in one pass
         for m in range(low, high):
             d = one / np.sqrt(one + b2 * c[m])
             c[m] = d
-            total += d * form[m]
+            form_sum += d * form[m]
             w0[m] *= d
             w1[m] *= d
             w2[m] *= d
-        return total
+        return form_sum
     if law == ONE:
         for m in range(low, high):
             c[m] = one
@@ -47,11 +47,11 @@ def diffuse(law, b2, c, form, w0, w1, w2, low, high):
             b4 = (b2 * c[m]) * (b2 * c[m]) * (b2 * c[m]) * (b2 * c[m])
             c[m] = one - np.exp(-c.dtype.type(WEICKERT_CONSTANT) / b4) if b4 > 1e-30 else one
     for m in range(low, high):
-        total += c[m] * form[m]
+        form_sum += c[m] * form[m]
         w0[m] *= c[m]
         w1[m] *= c[m]
         w2[m] *= c[m]
-    return total
+    return form_sum
 
 
 @nb.njit(cache=True, parallel=True, fastmath=FAST)
@@ -98,7 +98,7 @@ def symmetric(u, normal, forward, backward, spacing, law, outer, beta, dt, work,
             w0[m] = h0 * p0 * (u[a] - u[m]) + q0[m] + q0[a] if a != m else zero
             w1[m] = h1 * p1 * (u[b] - u[m]) + q1[m] + q1[b] if b != m else zero
             w2[m] = h2 * p2 * (u[d] - u[m]) + q2[m] + q2[d] if d != m else zero
-    return diverge(u, w0, w1, w2, r0, r1, r2, c, outer, u.dtype.type(dt), out), 0.5 * energies.sum()
+    return diverge(u, w0, w1, w2, r0, r1, r2, c, outer, u.dtype.type(dt), out), 0.5 * total(energies)
 
 
 @nb.njit(cache=True, parallel=True, fastmath=FAST)
@@ -127,7 +127,7 @@ def paper(u, normal, forward, backward, spacing, law, outer, beta, dt, work, out
             w2[m] = v2 * i2 if f2[m] != m else zero
         energies[block] = diffuse(law, u.dtype.type(beta) ** 2, c, out, w0, w1, w2, low, high)
     change = diverge(u, w0, w1, w2, backward[0], backward[1], backward[2], c, outer, u.dtype.type(dt), out)
-    return change, 0.5 * energies.sum()
+    return change, 0.5 * total(energies)
 
 
 @nb.njit(cache=True, parallel=True, fastmath=FAST)
@@ -148,4 +148,4 @@ def diverge(u, w0, w1, w2, r0, r1, r2, c, outer, dt, out):
             out[m] = u[m] + s
             change += s * s
         changes[block] = change
-    return changes.sum()
+    return total(changes)
