@@ -59,7 +59,7 @@ def evolve(
         u, out = out, u
         if not (np.isfinite(change[k]) and np.isfinite(energy[k])):
             raise NumericsError(
-                f"the flow left the finite numbers at iteration {k + 1}: found a change of {change[k]}, energy {energy[k]}; "
+                f"the flow left the finite numbers at iteration {k + 1}: change {change[k]}, energy {energy[k]}; "
                 "expected finite values (is DATA scaled beyond float32? try --precision float64)"
             )
         if extend is not None and extend_every and (k + 1) % extend_every == 0:

@@ -9,9 +9,10 @@ import numpy as np
 from beltrami_cli.errors import DataError
 from beltrami_cli.kernels import mesh as kernels
 
-# Makes a thin voxel's value outweigh any other: of two pairs of fourth roots, the thin one has the larger product even
-# where its values are a million times smaller.
-THIN_WEIGHT = np.float32(8)
+# Sizes given to marching cubes lie between FLOOR and 1 + FLOOR, and THIN_WEIGHT times that where the phase is thin: no
+# crossing then comes so near a node that single precision would lose the edge which it is on.
+FLOOR = np.float32(0.1)
+THIN_WEIGHT = np.float32(12)
 # Least squares for curvature: rings smaller than this, in voxels, say little about it.
 RING_VOXELS = 0.3
 
@@ -74,9 +75,9 @@ def zero_surface(psi: np.ndarray, spacing: np.ndarray) -> ZeroSurface:
     ijk, cells = (contour if psi.shape[2] == 1 else isosurface)(thin_first(psi), np.isfinite(psi))
     if not len(cells):
         raise DataError("the level set has no zero level among its finite values")
-    ijk = kernels.linear_crossings(psi, ijk)
+    start, ring = kernels.half_edges(cells, len(ijk))
+    ijk = kernels.linear_crossings(psi, ijk, start, ring)
     points = ijk * spacing
-    start, ring = kernels.half_edges(cells, len(points))
     raw = kernels.segment_normals(points, cells) if cells.shape[1] == 2 else kernels.face_normals(points, cells)
     mesh_normals = kernels.ring_mean(raw, start, ring)
     ijk, normals = kernels.refine_crossings(psi, ijk, spacing, mesh_normals)
@@ -103,7 +104,8 @@ def thin_first(psi: np.ndarray) -> np.ndarray:
             for part in (slice(None, -2), slice(1, -1), slice(2, None))
         )
         thin[here] |= (negative[before] == negative[after]) & (negative[before] != negative[here])
-    size = np.sqrt(np.sqrt(np.maximum(np.abs(psi), np.finfo(np.float32).tiny)))
+    size = np.abs(psi, where=np.isfinite(psi), out=np.ones_like(psi))
+    size = FLOOR + np.sqrt(np.sqrt(size / size.max()))
     return np.copysign(np.where(thin, THIN_WEIGHT * size, size), psi)
 
 

@@ -63,7 +63,7 @@ def test_refusal_prints_both_grids():
         require_same_grid(TWINS["RAS"], "psi.nii", TWINS["LAS"], "data.nii", remedy="resample it")
     first, *grids = str(refusal.value).splitlines()
     assert "data.nii does not lie on the grid of psi.nii" in first
-    assert "--resample" in first
+    assert "(resample it)" in first
     assert grids == [f"  psi.nii: {TWINS['RAS'].describe()}", f"  data.nii: {TWINS['LAS'].describe()}"]
     assert "5 x 7 x 6 voxels of 1 x 1.25 x 2 mm, affine [-1 0 0 13;" in grids[1]
 

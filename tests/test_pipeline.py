@@ -333,9 +333,6 @@ def test_values_stay_within_the_inputs_range(scene, flow, extension):
     assert seen(out).std() < (9.0 if extension == "none" else 5.0)  # from 10, and l1 is slow at the steepest slopes
 
 
-RAGGED = pytest.mark.xfail(strict=True, reason="overshoots at the band's ragged edge, over 1 % of the range")
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -345,9 +342,9 @@ RAGGED = pytest.mark.xfail(strict=True, reason="overshoots at the band's ragged 
         "--flow l1",
         "--flow tv",
         "--flow phi --beta 0.05",
-        pytest.param("--flow phi --phi weickert --beta 0.05", marks=RAGGED),
-        pytest.param("--flow l2 --scheme paper", marks=RAGGED),
-        pytest.param("--beta 0.05 --scheme paper", marks=RAGGED),
+        "--flow phi --phi weickert --beta 0.05",
+        "--flow l2 --scheme paper",
+        "--beta 0.05 --scheme paper",
     ],
 )
 def test_sharp_data_stay_within_the_inputs_range(tmp_path, options):

@@ -11,6 +11,8 @@ import numpy as np
 SMOOTH = 0.3
 # Least distance of a crossing from the ends of its grid edge, in voxels: far below what a level set resolves.
 EDGE = 1e-4
+# Coordinates nearer to a node than this are on it: half of what EDGE leaves, far above single precision.
+ON_NODE = 5e-5
 
 
 @nb.njit(cache=True)
@@ -112,33 +114,43 @@ def cubic_root(p0, p1, p2, p3, t):
 
 @nb.njit(cache=True)
 def edge_of(ijk, low):
-    """Axis of the grid edge that a crossing lies on; its lower node goes into low (3,)."""
-    axis, widest = 0, -1.0
+    """Axis of the grid edge that a vertex lies on, its lower node in low (3,); -1 for one in the middle of a cell."""
+    axis, across = -1, 0
     for a in range(3):
         low[a] = int(np.round(ijk[a]))
-        off_node = abs(ijk[a] - low[a])
-        if off_node > widest:
-            axis, widest = a, off_node
+        if abs(ijk[a] - low[a]) > ON_NODE:
+            axis = a
+            across += 1
+    if across != 1:
+        return -1
     low[axis] = int(np.floor(ijk[axis]))
     return axis
 
 
 @nb.njit(cache=True)
-def linear_crossings(psi, ijk):
-    """Crossings (V, 3), each known to lie on a grid edge, at the zero of Psi's straight line along it.
+def linear_crossings(psi, ijk, start, ring):
+    """Vertices (V, 3) of marching cubes, moved to the zero of Psi's straight line along the grid edge they lie on.
 
-    Kept off the nodes by EDGE, lest triangles lose their area where Psi is exactly 0 at a node.
+    Kept off the nodes by EDGE, lest triangles lose their area where Psi is exactly 0 at a node. The few vertices in the
+    middle of a cell go to the mean of their ring.
     """
     points = np.empty_like(ijk)
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     for v in range(len(ijk)):
         axis = edge_of(ijk[v], low)
+        if axis < 0:
+            points[v] = np.nan
+            continue
         high[:] = low
         high[axis] += 1
         before, after = psi[low[0], low[1], low[2]], psi[high[0], high[1], high[2]]
         for a in range(3):
             points[v, a] = low[a]
         points[v, axis] += min(max(before / (before - after), EDGE), 1 - EDGE)
+    for v in range(len(ijk)):
+        if np.isnan(points[v, 0]):
+            for a in range(3):
+                points[v, a] = np.mean(points[ring[start[v] : start[v + 1]], a])
     return points
 
 
@@ -180,7 +192,7 @@ def refine_crossings(psi, ijk, spacing, mesh_normals):
     low, at, gradient, line = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(4)
     for v in range(len(ijk)):
         axis = edge_of(ijk[v], low)
-        if low[axis] < 1 or low[axis] + 2 >= psi.shape[axis]:
+        if axis < 0 or low[axis] < 1 or low[axis] + 2 >= psi.shape[axis]:
             continue
         at[:] = low
         for k in range(4):
