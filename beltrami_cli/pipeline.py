@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beltrami_cli import formats
+from beltrami_cli import formats, kernels
 from beltrami_cli.config import Job, Settings
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.evolve import Observer
@@ -38,6 +38,8 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
     files = _Files(job, curve=1 in grid.shape)
     formats.require_writable(job.volume, grid)
     with formats.Stage(files.all, overwrite=job.overwrite, inputs=job.inputs) as stage:
+        with phases("numba"):
+            kernels.wake()
         with phases("read"), ThreadPoolExecutor(1) as pool:
             digests = pool.submit(lambda: [_sha256(path) for path in job.inputs])
             volume, psi = _read(job)

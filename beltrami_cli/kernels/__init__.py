@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numba as nb
+import numpy as np
 
 # Entries worked on at a time: their arrays stay in a core's cache, and sums over blocks of one size do not depend on
 # the number of threads.
@@ -18,6 +19,11 @@ def total(parts):
     for part in parts:
         s += part
     return s
+
+
+def wake() -> None:
+    """Call a kernel, so that numba loads what it needs for any (0.2 s of its imports)."""
+    total(np.zeros(1))
 
 
 def are_cached() -> bool:

@@ -6,6 +6,8 @@ Positions are in millimetres along the voxel axes (index times spacing) unless c
 import numba as nb
 import numpy as np
 
+from beltrami_cli.kernels import BLOCK
+
 # Psi counts as smooth at a crossing when its second differences along the edge stay below this share of its slope: the
 # distance to a sphere of 4 voxels' radius reaches 0.25; a clamp, a mask or the ridge between two banks 0.5 and more.
 SMOOTH = 0.3
@@ -182,30 +184,35 @@ def gradient_on_edge(psi, low, axis, line, t, spacing, gradient):
     return True
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, parallel=True)
 def refine_crossings(psi, ijk, spacing, mesh_normals):
     """Crossings (V, 3) moved to the zero of the cubic along their grid edge, and normals from differences of Psi.
 
     Both only where Psi is smooth there; elsewhere the linear crossing and the mesh's own normal stay.
     """
     points, normals = ijk.copy(), mesh_normals.copy()
-    low, at, gradient, line = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(4)
-    for v in range(len(ijk)):
-        axis = edge_of(ijk[v], low)
-        if axis < 0 or low[axis] < 1 or low[axis] + 2 >= psi.shape[axis]:
-            continue
-        at[:] = low
-        for k in range(4):
-            at[axis] = low[axis] - 1 + k
-            line[k] = psi[at[0], at[1], at[2]]
-        t = cubic_root(line[0], line[1], line[2], line[3], ijk[v, axis] - low[axis])
-        if not gradient_on_edge(psi, low, axis, line, t, spacing, gradient):
-            continue
-        size = np.sqrt((gradient**2).sum())
-        bend = max(abs(line[0] - 2 * line[1] + line[2]), abs(line[1] - 2 * line[2] + line[3]))
-        if bend <= SMOOTH * size * spacing[axis] and (gradient * mesh_normals[v]).sum() > 0.9 * size:
-            points[v, axis] = low[axis] + min(max(t, EDGE), 1 - EDGE)
-            normals[v] = gradient / size
+    for block in nb.prange((len(ijk) + BLOCK - 1) // BLOCK):
+        low, at, gradient, line = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(4)
+        for v in range(block * BLOCK, min(len(ijk), (block + 1) * BLOCK)):
+            axis = edge_of(ijk[v], low)
+            if axis < 0 or low[axis] < 1 or low[axis] + 2 >= psi.shape[axis]:
+                continue
+            at[:] = low
+            for k in range(4):
+                at[axis] = low[axis] - 1 + k
+                line[k] = psi[at[0], at[1], at[2]]
+            t = cubic_root(line[0], line[1], line[2], line[3], ijk[v, axis] - low[axis])
+            if not gradient_on_edge(psi, low, axis, line, t, spacing, gradient):
+                continue
+            size = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2)
+            along = 0.0
+            for a in range(3):
+                along += gradient[a] * mesh_normals[v, a]
+            bend = max(abs(line[0] - 2 * line[1] + line[2]), abs(line[1] - 2 * line[2] + line[3]))
+            if bend <= SMOOTH * size * spacing[axis] and along > 0.9 * size:
+                points[v, axis] = low[axis] + min(max(t, EDGE), 1 - EDGE)
+                for a in range(3):
+                    normals[v, a] = gradient[a] / size
     return points, normals
 
 
