@@ -14,7 +14,7 @@ from beltrami_cli.kernels import mesh as kernels
 FLOOR = np.float32(0.1)
 THIN_WEIGHT = np.float32(12)
 # Least squares for curvature: rings smaller than this, in voxels, say little about it.
-RING_VOXELS = 0.3
+RING_VOXELS = 0.1
 
 
 @dataclass(frozen=True, eq=False)

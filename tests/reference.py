@@ -128,12 +128,10 @@ def cubic_at(volume, ijk):
 def linear_at(u, e, offset, forward, backward, least):
     """Trilinear mean of the corners of the cell at `offset` (3,) from entry e that are reached and known; else None."""
     low = np.floor(offset).astype(int)
-    base = walk(e, low, forward, backward)
     total = weight = 0.0
     for corner in product((0, 1), repeat=3):
         w = np.prod([t if k else 1 - t for t, k in zip(offset - low, corner, strict=True)])
-        reached = None if base is None else walk(base, corner, forward, backward)
-        reached = walk(e, low + corner, forward, backward) if reached is None else reached
+        reached = walk(e, low + corner, forward, backward)
         if w > 0 and reached is not None and not np.isnan(u[reached]):
             total += w * u[reached]
             weight += w

@@ -134,16 +134,13 @@ def linear(u, start, offset, forward, backward, least, out):
     for m in nb.prange(len(start)):
         s0, s1, s2 = int(np.floor(offset[0, m])), int(np.floor(offset[1, m])), int(np.floor(offset[2, m]))
         t0, t1, t2 = offset[0, m] - s0, offset[1, m] - s1, offset[2, m] - s2
-        low = walk(start[m], s0, s1, s2, forward, backward)
         total, weight = 0.0, 0.0
         for corner in range(8):
             a, b, c = corner >> 2, corner >> 1 & 1, corner & 1
             w = (t0 if a else 1 - t0) * (t1 if b else 1 - t1) * (t2 if c else 1 - t2)
             if w == 0.0:
                 continue
-            e = walk(low, a, b, c, forward, backward) if low >= 0 else -1
-            if e < 0:  # by another way
-                e = walk(start[m], s0 + a, s1 + b, s2 + c, forward, backward)
+            e = walk(start[m], s0 + a, s1 + b, s2 + c, forward, backward)
             if e >= 0 and not np.isnan(u[e]):
                 total += w * u[e]
                 weight += w
