@@ -54,7 +54,7 @@ class Band:
     @property
     def finest(self) -> float:
         """The smallest voxel edge, mm, of the axes that have more than one voxel."""
-        return float(self.grid.spacing[np.array(self.grid.shape) > 1].min())
+        return float(self.grid.used_spacing.min())
 
     @property
     def nodes(self) -> tuple[int, int, int]:

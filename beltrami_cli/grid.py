@@ -46,6 +46,11 @@ class Grid:
         return np.asarray(np.linalg.norm(self.affine[:3, :3], axis=0))
 
     @property
+    def used_spacing(self) -> np.ndarray:
+        """(n,) voxel edge lengths in mm of the axes that have more than one voxel: two of them in a plane."""
+        return self.spacing[np.array(self.shape) > 1]
+
+    @property
     def handedness(self) -> int:
         """+1 where the index axes form a right-handed frame in RAS, -1 where left-handed."""
         return 1 if np.linalg.det(self.affine[:3, :3]) > 0 else -1

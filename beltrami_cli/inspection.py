@@ -46,7 +46,7 @@ def _near_surface(psi: Volume, name: str, within: float | None) -> np.ndarray:
         raise RefusedError(f"within: found {within:g}; expected a distance above 0 mm")
     require_usable(psi.grid, name)
     plane = PlaneLast(psi.grid)
-    widest = float(psi.grid.spacing[np.array(psi.grid.shape) > 1].max())
+    widest = float(psi.grid.used_spacing.max())
     reach = 0.5 * widest if within is None else within
     # Wider than what is looked at: a band's own rim is where the nearest vertex, not the surface, is in reach.
     band = band_of(psi.data, Settings(band=reach + 1.5 * widest), plane, Warnings(None))

@@ -112,7 +112,7 @@ def _check_grids(job: Job) -> Grid:
     require_usable(grid, str(job.inputs[0]))
     time_step(grid, job.settings)
     if not job.settings.flat:
-        job.settings.half_width(grid.spacing[np.array(grid.shape) > 1])
+        job.settings.half_width(grid.used_spacing)
     return grid
 
 

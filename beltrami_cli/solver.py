@@ -84,11 +84,15 @@ def denoise(
     if settings.flat != (psi is None):
         raise RefusedError("levelset: expected an array, or None together with flat=True")
     grid = _grid(values.shape, affine, spacing)
-    solved = solve(
-        None if psi is None else _as_float(psi, settings).reshape(grid.shape),
-        _as_float(values, settings).reshape(grid.shape),
-        grid, settings, Phases(), observer,
-    )  # fmt: skip
+    threads = numba.get_num_threads()
+    try:
+        solved = solve(
+            None if psi is None else _as_float(psi, settings).reshape(grid.shape),
+            _as_float(values, settings).reshape(grid.shape),
+            grid, settings, Phases(), observer,
+        )  # fmt: skip
+    finally:
+        numba.set_num_threads(threads)  # the caller's own choice
     return replace(solved, data=solved.data.reshape(values.shape))
 
 
@@ -153,7 +157,7 @@ def band_of(psi: np.ndarray | None, settings: Settings, plane: PlaneLast, warnin
     if psi is None:
         return flat_band(plane.grid)
     psi = _signed(plane.forth(psi), settings, warnings)
-    return build_band(psi, plane.grid, settings.half_width(plane.grid.spacing[np.array(plane.grid.shape) > 1]))
+    return build_band(psi, plane.grid, settings.half_width(plane.grid.used_spacing))
 
 
 def _signed(psi: np.ndarray, settings: Settings, warnings: Warnings) -> np.ndarray:
