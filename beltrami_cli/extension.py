@@ -100,9 +100,8 @@ def at_closest_points(band: Band, own: np.ndarray) -> np.ndarray:
 def transported(band: Band, own: np.ndarray) -> np.ndarray:
     """(E,) solution of the initial value problem of Sec. 2.1, run for twice the time that a front takes to the rim."""
     spacing = band.grid.spacing
-    dt = 0.9 / np.sqrt(
-        (1 / band.grid.used_spacing**2).sum()
-    )  # mm at unit speed: the upwind scheme's own bound, with a margin
+    # mm at unit speed: the upwind scheme's own bound, with a margin
+    dt = 0.9 / np.sqrt((1 / band.grid.used_spacing**2).sum())
     u, out = own.copy(), np.empty_like(own)
     for _ in range(int(np.ceil(2 * band.half_width / dt))):
         kernels.transport(u, band.normal, band.distance, band.forward, band.backward, spacing, band.finest, dt, out)
