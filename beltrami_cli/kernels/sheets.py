@@ -17,6 +17,9 @@ ASIDE = 0.66
 LINK_VOXELS = 2.5
 LINK_COSINE = 0.0
 
+# From a voxel to itself and to its six neighbours.
+MOVES = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+
 
 @nb.njit(cache=True, inline="always")
 def squared_distance(points, v, x0, x1, x2):
@@ -54,95 +57,70 @@ def descend(points, start, ring, v, x0, x1, x2):
         v = nearest
 
 
+@nb.njit(cache=True, inline="always")
+def lies_along_normal(points, normals, v, d, x0, x1, x2, half_width, aside):
+    """True where x, at squared distance d from v, is in v's normal tube: see ASIDE; `aside` is its floor, mm^2."""
+    height = (x0 - points[v, 0]) * normals[v, 0] + (x1 - points[v, 1]) * normals[v, 1]
+    height += (x2 - points[v, 2]) * normals[v, 2]
+    return abs(height) <= half_width and d - height * height <= max(aside, ASIDE**2 * d)
+
+
+@nb.njit(cache=True)
+def entry_of_sheet(v, e, vertex, after, points, normals, per_voxel):
+    """Of a voxel's entries e, after[e], ... the one on the sheet of vertex v; -1 where there is none."""
+    while e >= 0:
+        w = vertex[e]
+        if w == v or (squared_voxels(points, v, w, per_voxel) < TWIN_VOXELS**2 and cosine(normals, v, w) > TWIN_COSINE):
+            return e
+        e = after[e]
+    return -1
+
+
 @nb.njit(cache=True)
 def grow(shape, spacing, points, normals, start, ring, half_width):
-    """All entries of the band: (voxel (E,), vertex (E,), squared distance (E,)), in order of growth.
+    """All entries of the band, in order of growth: a voxel's entries are head[x], after[head[x]], ... to -1.
 
     A voxel has an entry for every sheet of the surface that it lies along the normal of, within `half_width` (mm): the
     vertex is a local minimum of the distance over the mesh. Growth starts at the voxels beside the vertices and
     passes each vertex on to the neighbours of its voxel, from where it descends to theirs.
+    Returns voxel (E,), vertex (E,), squared distance (E,), after (E,), head (X,).
     """
-    voxels = shape[0] * shape[1] * shape[2]
     stride = (shape[1] * shape[2], shape[2], 1)
-    head = np.full(voxels, -1, np.int32)
+    head = np.full(shape[0] * shape[1] * shape[2], -1, np.int32)
     capacity = 16 * len(points) + 1024
     voxel, vertex, after = np.empty(capacity, np.int32), np.empty(capacity, np.int32), np.empty(capacity, np.int32)
     distance = np.empty(capacity)
-    entries = 0
-    pace = np.max(spacing) ** 2
-    per_voxel = 1 / spacing
+    per_voxel, aside = 1 / spacing, np.max(spacing) ** 2
     reach = (half_width + 0.5 * np.max(spacing)) ** 2
     at = np.empty(3, np.int64)
-    seed, grown = 0, 0
-    while seed < 2 * len(points) or grown < entries:
-        if seed < 2 * len(points):
-            v = seed // 2
+    entries, seeds, grown = 0, 0, 0
+    while seeds < 2 * len(points) or grown < entries:
+        if seeds < 2 * len(points):  # the voxels at both ends of the grid edge that the vertex is on
+            v, moves = seeds // 2, MOVES[:1]
             for a in range(3):
                 i = points[v, a] / spacing[a]
-                at[a] = int(np.floor(i + 1e-6)) if seed % 2 == 0 else int(np.ceil(i - 1e-6))
-            tries = 1
-            seed += 1
+                at[a] = int(np.floor(i + 1e-6)) if seeds % 2 == 0 else int(np.ceil(i - 1e-6))
+            seeds += 1
         else:
-            v = vertex[grown]
-            at[0], at[1], at[2] = (
-                voxel[grown] // stride[0],
-                voxel[grown] // stride[1] % shape[1],
-                voxel[grown] % shape[2],
-            )
-            tries = 6
+            v, x, moves = vertex[grown], voxel[grown], MOVES[1:]
+            at[0], at[1], at[2] = x // stride[0], x // stride[1] % shape[1], x % shape[2]
             grown += 1
-        for step in range(tries):
-            i, j, k = at[0], at[1], at[2]
-            if tries == 6:
-                move = 1 if step % 2 == 0 else -1
-                if step < 2:
-                    i += move
-                elif step < 4:
-                    j += move
-                else:
-                    k += move
+        for move in range(len(moves)):
+            i, j, k = at[0] + moves[move, 0], at[1] + moves[move, 1], at[2] + moves[move, 2]
             if i < 0 or j < 0 or k < 0 or i >= shape[0] or j >= shape[1] or k >= shape[2]:
                 continue
             x = i * stride[0] + j * stride[1] + k
             x0, x1, x2 = i * spacing[0], j * spacing[1], k * spacing[2]
-            known = False
-            e = head[x]
-            while e >= 0:
-                w = vertex[e]
-                # A sheet that is there already, by a vertex that v does not better.
-                if w == v or (
-                    tries == 6
-                    and squared_voxels(points, v, w, per_voxel) < TWIN_VOXELS**2
-                    and cosine(normals, v, w) > TWIN_COSINE
-                    and squared_distance(points, v, x0, x1, x2) >= distance[e]
-                ):
-                    known = True
-                    break
-                e = after[e]
-            if known:
-                continue
+            e = entry_of_sheet(v, head[x], vertex, after, points, normals, per_voxel)
+            if e >= 0 and squared_distance(points, v, x0, x1, x2) >= distance[e]:
+                continue  # the sheet is there already, by a vertex that v does not better
             w, d = descend(points, start, ring, v, x0, x1, x2)
-            if d > reach:
+            if d > reach or not lies_along_normal(points, normals, w, d, x0, x1, x2, half_width, aside):
                 continue
-            height = abs(
-                (x0 - points[w, 0]) * normals[w, 0]
-                + (x1 - points[w, 1]) * normals[w, 1]
-                + (x2 - points[w, 2]) * normals[w, 2]
-            )
-            if height > half_width or d - height * height > max(pace, ASIDE**2 * d):
-                continue
-            e = head[x]
-            while e >= 0:
-                o = vertex[e]
-                if o == w or (
-                    squared_voxels(points, o, w, per_voxel) < TWIN_VOXELS**2 and cosine(normals, o, w) > TWIN_COSINE
-                ):
-                    if d < distance[e]:
-                        vertex[e], distance[e] = w, d
-                    known = True
-                    break
-                e = after[e]
-            if known:
+            e = entry_of_sheet(w, head[x], vertex, after, points, normals, per_voxel)
+            if e >= 0:
+                if d < distance[e]:
+                    vertex[e], distance[e] = w, d
                 continue
             if entries == capacity:
                 capacity *= 2
