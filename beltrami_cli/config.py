@@ -49,7 +49,7 @@ class Beta:
     def __str__(self) -> str:
         if self.is_auto:
             return "auto"
-        text = (":" if self.law else ",").join(f"{v:g}" for v in self.values)
+        text = (":" if self.law else ",").join(map(repr, self.values))
         return f"{text}:{self.law}" if self.law else text
 
 
@@ -287,10 +287,18 @@ def make_job(given: Mapping[str, Any]) -> Job:
 
 
 def overlaid(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of `over` in place of those of `base`; one way to say how long to run displaces the others."""
+    """Fields of `over` in place of those of `base`; what they displace goes with them.
+
+    One way to say how long to run displaces the others, another flow the old one's parameters, flat all of the surface.
+    """
     durations = {"iterations", "time", "fwhm"}
-    kept = {k: v for k, v in base.items() if not (k in durations and durations & over.keys())}
-    return {**kept, **over}
+    displaced = durations if durations & over.keys() else set()
+    if "flow" in over:
+        takes = {"l2": set(), "l1": {"eps"}, "tv": {"eps"}, "phi": {"phi", "beta"}}.get(over["flow"], {"beta"})
+        displaced = displaced | ({"phi", "beta", "eps"} - takes)
+    if over.get("flat"):
+        displaced = displaced | {"levelset", "mesh", "resample", "band", "extension", "extend_every"}
+    return {**{k: v for k, v in base.items() if k not in displaced}, **over}
 
 
 def parse_spacing(given: Any) -> tuple[float, ...]:

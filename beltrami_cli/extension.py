@@ -42,9 +42,9 @@ def extend(band: Band, samples: np.ndarray, method: str = "closest-point") -> Ex
     """Carry data off the surface on every sheet.
 
     samples: (E,), a volume's values at the entries (`Band.gather`), NaN where missing; only primary entries count.
-    method: "closest-point" (each entry takes the trilinear value of valid voxels at its closest surface point), "pde"
-    (U_t + sign(Psi) grad U . grad Psi = 0, Sec. 2.1) or "none" (each voxel keeps its own value; sheets other than the
-    nearest take the closest point's). Holes are then filled from the band around them.
+    method: "closest-point" (each entry takes the value of valid voxels at its closest surface point, see
+    `at_closest_points`), "pde" (U_t + sign(Psi) grad U . grad Psi = 0, Sec. 2.1) or "none" (each voxel keeps its own
+    value; sheets other than the nearest take the closest point's). Holes are then filled from the band around them.
     Raises DataError where no entry is reached by valid data.
     """
     if band.surface is None:

@@ -33,9 +33,13 @@ class Grid:
         """Axis-aligned grid with its first voxel at the origin.
 
         shape: one to three axes; the missing ones get length 1.
-        spacing: mm, one for all axes or one for each of the first (1 mm for the rest).
+        spacing: mm, one for all axes or one for each (two for a plane). Raises RefusedError for two on three axes.
         """
         nx, ny, nz = (*map(int, shape), 1, 1)[:3]
+        if isinstance(spacing, tuple) and len(spacing) == 2 and nz > 1:
+            raise RefusedError(
+                f"spacing: found two numbers for three axes of {nx} x {ny} x {nz}; expected one or three"
+            )
         edges = np.ones(3)
         edges[: len(spacing) if isinstance(spacing, tuple) else 3] = spacing
         return Grid((nx, ny, nz), np.diag([*edges, 1.0]))

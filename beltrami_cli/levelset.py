@@ -106,7 +106,8 @@ def thin_first(psi: np.ndarray) -> np.ndarray:
         thin[here] |= (negative[before] == negative[after]) & (negative[before] != negative[here])
     size = np.abs(psi, where=np.isfinite(psi), out=np.ones_like(psi))
     size = FLOOR + np.sqrt(np.sqrt(size / size.max()))
-    return np.copysign(np.where(thin, THIN_WEIGHT * size, size), psi)
+    size = np.where(thin, THIN_WEIGHT * size, size)
+    return np.where(negative, -size, size)
 
 
 def isosurface(psi: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -30,18 +30,19 @@ REMEDY = "--resample brings DATA onto the level set's grid"
 def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], None] | None = None) -> Result:
     """Denoise files: read, check, denoise, write OUT, mesh and sidecar. Nothing is written unless everything is.
 
-    notify: called with each warning as soon as it is known. Raises as `denoise`, and RefusedError before anything is
-    read where an output exists or cannot be written, or the grids differ.
+    notify: called with each warning as soon as it is known. Raises as `denoise`, and RefusedError, from
+    the headers alone, where an output exists or cannot be written, or the grids differ.
     """
     phases = Phases()
     grid = _check_grids(job)
     files = _Files(job, curve=1 in grid.shape)
     formats.require_writable(job.volume, grid)
-    with formats.Stage(files.all, overwrite=job.overwrite, inputs=job.inputs) as stage:
+    sources = [file for path in job.inputs for file in formats.input_files(path)]
+    with formats.Stage(files.all, overwrite=job.overwrite, inputs=sources) as stage:
         with phases("numba"):
             kernels.wake()
         with phases("read"), ThreadPoolExecutor(1) as pool:
-            digests = pool.submit(lambda: [_sha256(path) for path in job.inputs])
+            digests = pool.submit(lambda: [_sha256(path) for path in sources])
             volume, psi = _read(job)
             hashes = digests.result()
         solved = solve(
@@ -52,7 +53,7 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
             for path in files.meshes:
                 assert solved.mesh is not None
                 formats.write_mesh(stage.path(path), solved.mesh)
-        record = sidecar(job, files.all, hashes, solved.record, solved.warnings, phases.seconds)
+        record = sidecar(job, sources, files.all, hashes, solved.record, solved.warnings, phases.seconds)
         stage.path(files.sidecar).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
         stage.commit()
     return replace(solved, record=record)
@@ -110,7 +111,7 @@ def _check_grids(job: Job) -> Grid:
     if job.levelset is not None and not job.resample:
         require_same_grid(grid, f"LEVELSET {job.levelset}", grids[job.data], f"DATA {job.data}", remedy=REMEDY)
     require_usable(grid, str(job.inputs[0]))
-    time_step(grid, job.settings)
+    job.settings.duration(time_step(grid, job.settings))
     if not job.settings.flat:
         job.settings.half_width(grid.used_spacing)
     return grid

@@ -29,13 +29,15 @@ def what_happened(
     samples: np.ndarray,
     values: np.ndarray,
     known: np.ndarray,
+    excess: float,
 ) -> dict[str, Any]:
     """What was used and what happened, JSON-ready; lengths mm, dt mm^2, beta mm per data unit."""
     primary = band.primary
     near = primary[np.abs(band.distance[primary]) <= 0.5 * grid.spacing.max()]
     removed = (samples[near] - values[near]).astype(float)
     removed = removed[np.isfinite(removed)]
-    used = {**asdict(settings), "beta": str(settings.beta), "band": band.half_width, "dt": schedule.dt}
+    used = {**asdict(settings), "band": band.half_width, "dt": schedule.dt}
+    used["beta"] = _beta_used(settings, schedule)
     used["extend_every"] = settings.reextends_every
     used["iterations"] = schedule.iterations
     used["threads"] = numba.get_num_threads()
@@ -61,6 +63,7 @@ def what_happened(
             "voxels": int(removed.size),
             "meaning": "input minus output at valid voxels within half a voxel of the surface",
         },
+        "ClippedExcess": excess,
         "PerIteration": {
             "beta": schedule.beta.tolist(),
             "dt": [schedule.dt] * schedule.iterations,
@@ -71,8 +74,18 @@ def what_happened(
     }
 
 
+def _beta_used(settings: Settings, schedule: Schedule) -> float | str | None:
+    """The number where beta was one, the schedule where it changed, None for a flow that has none."""
+    if settings.flow in ("l2", "l1", "tv"):
+        return None
+    if len(set(schedule.beta.tolist())) == 1:
+        return float(schedule.beta[0])
+    return str(settings.beta)
+
+
 def sidecar(
     job: Job,
+    sources: list[Path],
     files: list[Path],
     hashes: list[str],
     happened: dict[str, Any],
@@ -82,13 +95,11 @@ def sidecar(
     """The record of a run on files, with names as in BIDS derivatives."""
     return {
         "GeneratedBy": [{"Name": "beltrami_cli", "Version": __version__}],
-        "Sources": [
-            {"Path": os.fspath(path), "SHA256": digest} for path, digest in zip(job.inputs, hashes, strict=True)
-        ],
+        "Sources": [{"Path": os.fspath(path), "SHA256": digest} for path, digest in zip(sources, hashes, strict=True)],
         "Outputs": [os.fspath(file) for file in files],
         "Created": datetime.now(UTC).isoformat(timespec="seconds"),
         **happened,
-        "Files": {"resample": job.resample, "spacing": job.spacing},
+        "Parameters": {**happened["Parameters"], "resample": job.resample, "spacing": job.spacing},
         "Warnings": list(warnings),
         "Seconds": {name: round(spent, 3) for name, spent in seconds.items()},
         "PeakMemoryMiB": _peak_memory_mib(),

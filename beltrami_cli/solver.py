@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numba
@@ -66,11 +66,9 @@ def denoise(
 
     The flow is Eq. 20 of "The Beltrami Flow over Implicit Manifolds" on a narrow band with one sheet per bank.
     """
-    try:
-        settings = Settings(**options)
-    except TypeError as error:
-        name = str(error).rsplit(" ", 1)[-1]
-        raise RefusedError(f"unknown option {name}; the options are the fields of config.Settings") from None
+    for name in options.keys() - {field.name for field in fields(Settings)}:
+        raise RefusedError(f"unknown option {name!r}; the options are the fields of config.Settings")
+    settings = Settings(**options)
     if isinstance(data, np.ma.MaskedArray):
         data = np.ma.filled(data.astype(float), np.nan)
     values = np.asarray(data)
@@ -99,7 +97,7 @@ def denoise(
 def _grid(shape: tuple[int, ...], affine: np.ndarray | None, spacing: float | Sequence[float] | None) -> Grid:
     """The grid of an array; raises RefusedError where affine or spacing cannot place voxels."""
     if affine is None:
-        steps = (1.0,) if spacing is None else parse_spacing(spacing if np.isscalar(spacing) else list(spacing))  # type: ignore[arg-type]
+        steps = (1.0,) if spacing is None else parse_spacing(np.asarray(spacing).tolist())
         return Grid.from_spacing(shape, steps[0] if len(steps) == 1 else steps)
     matrix = np.asarray(affine)
     usable = matrix.shape == (4, 4) and matrix.dtype.kind in "fiu" and np.isfinite(matrix).all()
@@ -147,8 +145,7 @@ def solve(
         mesh = None if settings.flat else surface_mesh(band, values)
     outside: dict[str, np.ndarray | float] = {"nan": np.nan, "zero": 0.0, "keep": plane.forth(data)}
     out = plane.back(band.scatter(values, outside[settings.outside]))
-    record = what_happened(settings, grid, band, schedule, evolution, slope, samples, values, start.known)
-    record["ClippedExcess"] = excess
+    record = what_happened(settings, grid, band, schedule, evolution, slope, samples, values, start.known, excess)
     return Result(out, mesh, record, tuple(warnings.lines))
 
 
@@ -169,8 +166,8 @@ def _signed(psi: np.ndarray, settings: Settings, warnings: Warnings) -> np.ndarr
             f"the level set holds two values only ({low:g} and {high:g}): a mask, whose surface is a staircase of "
             "voxels, accurate to half a voxel; give a signed distance or another smooth function for a better one"
         )
-        if low >= 0:  # a mask of something: what it marks is inside
-            psi = (low + high) / 2 - psi
+        if low >= 0:  # a mask of something: what it marks is inside, whatever the sign
+            return (low + high) / 2 - psi
     return -psi if settings.inside == "positive" else psi
 
 
@@ -195,7 +192,7 @@ def _within_range(values: np.ndarray, start: Extended) -> tuple[np.ndarray, floa
     data = start.values[start.known].astype(float)
     low, high = data.min(), data.max()
     excess = max(low - float(np.nanmin(values)), float(np.nanmax(values)) - high, 0.0)
-    rounding = np.finfo(values.dtype).eps * len(values) * max(abs(low), abs(high))
+    rounding = 1e-3 * max(abs(low), abs(high))  # of thousands of steps on nearly constant data
     if not excess <= high - low + rounding:
         raise NumericsError(
             f"the flow ran away: found values {excess:.6g} beyond the data's own {low:.6g} to {high:.6g}; "
@@ -249,7 +246,8 @@ class Warnings:
 def _as_float(array: np.ndarray, settings: Settings) -> np.ndarray:
     if array.dtype.kind not in "fiub":
         raise RefusedError(f"found values of type {array.dtype}; expected real numbers")
-    return array.astype(settings.precision)
+    with np.errstate(over="ignore"):  # what is too large becomes infinite, and is reported as that
+        return array.astype(settings.precision)
 
 
 def require_usable(grid: Grid, name: str) -> None:

@@ -162,7 +162,7 @@ def test_config_alone(folder):
     path = config(folder, FILES, OUTPUT, "[flow]\nbeta = 0.1", "[time]\niterations = 3", "[band]\nhalf_width = 3")
     done("denoise", "--config", path)
     used = record(folder / "out.json")
-    assert (used["Parameters"]["beta"], used["Parameters"]["band"], used["Iterations"]) == ("0.1", 3.0, 3)
+    assert (used["Parameters"]["beta"], used["Parameters"]["band"], used["Iterations"]) == (0.1, 3.0, 3)
     assert (folder / "out.surf.gii").exists()
 
 
@@ -306,3 +306,16 @@ def test_flat_config(folder):
     path = config(folder, '[input]\ndata = "volumes/data.nii.gz"', OUTPUT, "[flow]\nflat = true")
     assert beltrami("denoise", "--config", path, "-q").code == 0
     assert record(folder / "out.json")["Parameters"]["flat"] is True
+
+
+@pytest.mark.parametrize(
+    ("base", "over", "expected"),
+    [
+        ({"beta": 0.1}, {"flow": "l2"}, {"flow": "l2"}),
+        ({"flow": "l1", "eps": 2}, {"flow": "tv"}, {"flow": "tv", "eps": 2}),
+        ({"beta": 0.1}, {"flow": "beltrami"}, {"flow": "beltrami", "beta": 0.1}),
+        ({"levelset": "p", "band": 3, "beta": 1}, {"flat": True}, {"flat": True, "beta": 1}),
+    ],
+)
+def test_what_an_override_displaces_goes_with_it(base, over, expected):
+    assert overlaid(base, over) == expected

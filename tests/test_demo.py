@@ -48,7 +48,7 @@ def test_with_a_picture(phantom, tmp_path):
     near = np.abs(load(phantom / "levelset.nii.gz")) < 0.5
     error = (load(folder / "denoised.nii.gz") - load(phantom / "clean.nii.gz"))[near]
     assert after == pytest.approx(20 * np.log10(255 / np.sqrt(np.mean(error**2))), abs=0.06)
-    assert record(folder / "denoised.json")["Parameters"]["beta"] == "0.1"
+    assert record(folder / "denoised.json")["Parameters"]["beta"] == 0.1
 
 
 def test_without_matplotlib(phantom, tmp_path, no_matplotlib):

@@ -76,3 +76,9 @@ def test_volume_keeps_its_file_shape_and_header():
     assert Volume(np.zeros((2, 3, 1)), grid).file_shape == (2, 3, 1)
     with pytest.raises(ValueError, match=r"\(3, 2, 1\)"):
         Volume(np.zeros((3, 2, 1)), grid)
+
+
+def test_two_spacings_are_for_a_plane():
+    assert Grid.from_spacing((4, 5), (2.0, 3.0)).spacing.tolist() == [2, 3, 1]
+    with pytest.raises(RefusedError, match="two numbers"):
+        Grid.from_spacing((4, 5, 6), (2.0, 3.0))

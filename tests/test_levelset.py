@@ -183,3 +183,13 @@ def test_sphere_in_the_world():
     assert np.abs(np.linalg.norm(at, axis=1) - radius).max() < 0.1
     assert abs(volume_inside(at, found.cells) / (4 / 3 * np.pi * radius**3) - 1) < 0.02
     assert np.abs(found.values - at @ [1.0, 2.0, 2.0] / 3).max() < 1e-3
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_rounded_psi_with_zeros_of_both_signs(axes):
+    x = np.indices((20,) * axes) - 9.3
+    psi = np.round(np.sqrt((x**2).sum(0)) - 6).reshape((20, 20, -1) if axes == 3 else (20, 20, 1))
+    assert (np.signbit(psi) & (psi == 0)).any() and (~np.signbit(psi) & (psi == 0)).any()
+    surface = zero_surface(psi, np.ones(3))
+    radius = np.linalg.norm(surface.points[:, :axes] - 9.3, axis=1)
+    assert np.abs(radius - 6).max() < 1.0

@@ -208,7 +208,7 @@ def test_resample_brings_data_onto_the_level_sets_grid(scene, tmp_path):
     assert np.array_equal(image.affine, np.eye(4))
     near = np.argwhere(np.isfinite(values))
     assert np.abs(values[tuple(near.T)] - linear_field(near)).max() < 1e-3
-    assert record(tmp_path / "out.json")["Files"]["resample"] is True
+    assert record(tmp_path / "out.json")["Parameters"]["resample"] is True
 
 
 def refused_grids(*arguments: object) -> str:
@@ -577,3 +577,31 @@ def test_surface_cut_by_the_volumes_face(tmp_path):
     mesh, values = ply(tmp_path / "m.ply")
     assert np.isfinite(values).all()
     assert not mesh.is_watertight
+
+
+def test_what_a_mask_marks_is_inside_whatever_the_sign():
+    from beltrami_cli import denoise
+
+    x = np.indices((20, 20, 20)) - 9.3
+    mask = ((x**2).sum(0) < 36).astype(float)
+    for inside in ("negative", "positive"):
+        mesh = denoise(mask, x[0], inside=inside, iterations=0).mesh
+        corners = mesh.vertices_ras_mm[mesh.cells]
+        volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+        assert volume == pytest.approx(mask.sum(), rel=0.1)
+
+
+def test_voxels_of_an_input_pair_are_never_replaced_and_are_hashed(tmp_path):
+    done("phantom", "torus", tmp_path, "--size", "20", "--format", "mha")
+    import SimpleITK as sitk
+
+    for part in ("levelset", "noisy"):
+        sitk.WriteImage(sitk.ReadImage(str(tmp_path / f"{part}.mha")), str(tmp_path / f"{part}.mhd"))
+    other = tmp_path / "other.mhd"
+    other.write_text((tmp_path / "noisy.mhd").read_text().replace("noisy.raw", "out.raw"))
+    (tmp_path / "noisy.raw").rename(tmp_path / "out.raw")
+    arguments = ("denoise", tmp_path / "levelset.mhd", other, "--no-mesh")
+    assert "is an input" in refused(*arguments, "-o", tmp_path / "out.mhd", "--overwrite")
+    done(*arguments, "-o", tmp_path / "fine.mhd")
+    sources = [Path(source["Path"]).name for source in record(tmp_path / "fine.json")["Sources"]]
+    assert sources == ["levelset.mhd", "levelset.raw", "other.mhd", "out.raw"]

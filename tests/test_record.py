@@ -45,10 +45,12 @@ def test_provenance(scene, tmp_path):
 def test_parameters_as_used(scene, tmp_path):
     levelset, data, out = scene
     done("denoise", levelset, data, "-o", out)
-    used = record(tmp_path / "out.json")["Parameters"]
-    assert set(used) == PARAMETERS
+    written = record(tmp_path / "out.json")
+    used = written["Parameters"]
+    assert set(used) == PARAMETERS | {"resample", "spacing"}
+    assert used["beta"] == written["PerIteration"]["beta"][0]
     expected = {
-        "flow": "beltrami", "phi": None, "beta": "auto", "eps": None, "scheme": "symmetric", "flat": False, "dt": 0.15,
+        "flow": "beltrami", "phi": None, "eps": None, "scheme": "symmetric", "flat": False, "dt": 0.15,
         "time": None, "fwhm": None, "extension": "closest-point", "extend_every": 5, "band": 4.0,
         "inside": "negative", "outside": "nan", "precision": "float32",
     }  # fmt: skip
@@ -174,4 +176,5 @@ def test_files(tmp_path):
     np.save(psi, ball((24, 24), 8.0))
     np.save(data, noisy((24, 24)))
     done("denoise", psi, data, "-o", tmp_path / "o.npy", "--spacing", "1,2")
-    assert record(tmp_path / "o.json")["Files"] == {"resample": False, "spacing": [1.0, 2.0]}
+    used = record(tmp_path / "o.json")["Parameters"]
+    assert (used["resample"], used["spacing"]) == (False, [1.0, 2.0])

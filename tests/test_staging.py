@@ -135,3 +135,19 @@ def test_one_folder_under_two_spellings(tmp_path, monkeypatch):
             stage.path(final).write_text("x")
         stage.commit()
     assert everything_in(tmp_path) == {"o.npy", "o.json"}
+
+
+def test_runs_that_share_a_mesh_folder_do_not_meet(tmp_path):
+    for name in ("s1", "s2", "meshes"):
+        (tmp_path / name).mkdir()
+    outputs = [[tmp_path / f"s{k}" / "o.npy", tmp_path / "meshes" / f"{k}.ply"] for k in (1, 2)]
+    with Stage(outputs[0]) as first:
+        for final in outputs[0]:
+            first.path(final).write_text("first")
+        with Stage(outputs[1]) as second:
+            for final in outputs[1]:
+                second.path(final).write_text("second")
+            second.commit()
+        first.commit()
+    assert [path.read_text() for path in outputs[0] + outputs[1]] == ["first", "first", "second", "second"]
+    assert sorted(path.name for path in (tmp_path / "meshes").iterdir()) == ["1.ply", "2.ply"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from beltrami_cli.cli.common import Command, say
+from beltrami_cli.cli.common import Command, announce_compilation, note, say
 
 FILE = click.Path(path_type=Path)
 
@@ -21,7 +21,7 @@ FILE = click.Path(path_type=Path)
 @click.option("--max-abs", type=float, metavar="X", help="Tolerance: the largest difference.")
 @click.option("--max-rms", type=float, metavar="X", help="Tolerance: the root mean square difference.")
 @click.option("--min-psnr", type=float, metavar="X", help="Tolerance: peak signal to noise in dB, over --data-range.")
-@click.option("--data-range", type=float, metavar="R", help="Full scale for PSNR. Default: A's range.")
+@click.option("--data-range", type=float, metavar="R", help="Full scale for PSNR. Default: A's range, or --period.")
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
 def compare(
     a: Path,
@@ -42,6 +42,8 @@ def compare(
 
     if within is not None and levelset is None:
         raise click.UsageError("--within needs --levelset, the surface to be near to")
+    if levelset is not None:
+        announce_compilation(quiet)
     found = compare_volumes(a, b, levelset=levelset, within=within, period=period, data_range=data_range)
     broken = found.exceeds(max_abs=max_abs, max_rms=max_rms, min_psnr=min_psnr)
     if as_json:
@@ -51,6 +53,9 @@ def compare(
         say(quiet, f"B - A     max {found.max_abs:.6g}, rms {found.rms:.6g}, mean {found.mean:.6g}")
         say(quiet, f"psnr      {found.psnr:.2f} dB over a range of {found.data_range:.6g}")
         say(quiet, f"correlation {found.correlation:.6f}")
+    judged = any(limit is not None for limit in (max_abs, max_rms, min_psnr))
+    if judged and found.only_in_a:
+        note(quiet, f"warning: {found.only_in_a} voxels with a value in A have none in B: no tolerance looks at them")
     for line in broken:
         click.echo(f"beltrami: out of tolerance: {line}", err=True)
     return 1 if broken else 0

@@ -19,6 +19,7 @@ from beltrami_cli.surface import Mesh
 
 __all__ = [
     "Stage",
+    "input_files",
     "mesh_beside",
     "mesh_files",
     "mesh_format",
@@ -105,6 +106,18 @@ def read_volume(path: Path, *, spacing: float | Sequence[float] | None = None, d
             return png.read(path, dtype)
         case _:
             return npy.read(path, _steps(spacing), dtype)
+
+
+def input_files(path: Path) -> list[Path]:
+    """Every file that `read_volume` reads for this path: both of a pair of header and voxels."""
+    path = Path(path)
+    match volume_format(path):
+        case "NIfTI":
+            return nifti.files(path)
+        case "MetaImage":
+            return metaimage.input_files(path)
+        case _:
+            return [path]
 
 
 def volume_files(path: Path) -> list[Path]:

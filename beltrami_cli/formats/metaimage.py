@@ -94,13 +94,19 @@ def _open(path: Path) -> Any:
     return reader
 
 
-def _require_voxels(path: Path) -> None:
+def input_files(path: Path) -> list[Path]:
+    """The header's own file, and the file of voxels that it names, where it names one."""
     with path.open("rb") as file:
         # Long enough for any header seen; the entry stands last in it.
         entry = re.search(rb"^ElementDataFile\s*=\s*(.+?)\s*$", file.read(65536), re.MULTILINE)
     name = entry.group(1).decode(errors="replace") if entry else "LOCAL"
-    if not name.upper().startswith(("LOCAL", "LIST")) and "%" not in name and not (path.parent / name).exists():
-        raise RefusedError(f"{path}: half of a pair; expected {name} beside it; fetch that file too")
+    return [path] if name.upper().startswith(("LOCAL", "LIST")) or "%" in name else [path, path.parent / name]
+
+
+def _require_voxels(path: Path) -> None:
+    for part in input_files(path):
+        if not part.exists():
+            raise RefusedError(f"{path}: half of a pair; expected {part.name} beside it; fetch that file too")
 
 
 def _grid(path: Path, reader: Any) -> Grid:

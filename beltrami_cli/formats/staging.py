@@ -74,7 +74,9 @@ class Stage:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _folder(self, parent: Path) -> Path:
-        return parent.resolve() / f".{self._finals[0].name}.partial"
+        # Named after a file that is made there, so that runs which share a folder do not meet in it.
+        first = next(final for final in self._finals if final.parent.resolve() == parent.resolve())
+        return parent.resolve() / f".{first.name}.partial"
 
     def _folders(self) -> list[Path]:
         return list(dict.fromkeys(self._folder(final.parent) for final in self._finals))

@@ -27,8 +27,7 @@ def wake() -> None:
 
 
 def are_cached() -> bool:
-    """False before the first-ever use, when compiling takes about half a minute."""
-    from beltrami_cli.kernels import steps
+    """False before the first-ever band, when compiling takes about half a minute."""
+    from beltrami_cli.kernels import sheets
 
-    folder = Path(steps.symmetric.stats.cache_path)
-    return any(folder.glob("steps.symmetric-*.nbi"))
+    return any(Path(sheets.grow.stats.cache_path).glob("sheets.grow-*.nbi"))

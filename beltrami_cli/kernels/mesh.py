@@ -52,7 +52,7 @@ def half_edges(cells, vertices):
 
 @nb.njit(cache=True)
 def face_normals(points, triangles):
-    """Unit vertex normals (V, 3): area-weighted mean of the faces around, then of the one-ring."""
+    """Sum (V, 3) of the normals of the faces around each vertex, as long as twice their areas (mm^2)."""
     faces = np.zeros_like(points)
     for c in range(len(triangles)):
         a, b, d = triangles[c, 0], triangles[c, 1], triangles[c, 2]
