@@ -10,7 +10,7 @@ from beltrami_cli import formats
 from beltrami_cli.config import Settings
 from beltrami_cli.errors import BeltramiError, RefusedError
 from beltrami_cli.grid import Volume, require_same_grid
-from beltrami_cli.levelset import crossing_box
+from beltrami_cli.levelset import crossing_box, two_values
 from beltrami_cli.metrics import Difference, difference
 from beltrami_cli.solver import PlaneLast, Warnings, band_of, require_usable
 
@@ -74,9 +74,8 @@ def describe_volume(path: Path) -> list[str]:
 
 
 def _as_levelset(values: np.ndarray, finite: np.ndarray) -> str:
-    low, high = finite.min(), finite.max()
-    if low < high and np.all((finite == low) | (finite == high)):
-        return f"a mask of {low:g} and {high:g}: its surface would be a staircase"
+    if mask := two_values(values):
+        return f"a mask of {mask[0]:g} and {mask[1]:g}: its surface would be a staircase"
     try:
         box = crossing_box(values, (0, 0, 0))
     except BeltramiError:

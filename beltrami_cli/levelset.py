@@ -66,6 +66,13 @@ def crossing_box(psi: np.ndarray, margin: tuple[int, ...]) -> tuple[slice, ...]:
     )
 
 
+def two_values(psi: np.ndarray) -> tuple[float, float] | None:
+    """The two values of a mask, the lower first; None where the finite values are fewer or more than two."""
+    finite = psi[np.isfinite(psi)]
+    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 0.0)
+    return (low, high) if low < high and np.all((finite == low) | (finite == high)) else None
+
+
 def zero_surface(psi: np.ndarray, spacing: np.ndarray) -> ZeroSurface:
     """Marching cubes (marching squares in a plane, the last axis having length 1) at Psi = 0.
 

@@ -17,6 +17,7 @@ from beltrami_cli.evolve import Observer, Schedule, evolve
 from beltrami_cli.extension import Extended, Reextension, extend
 from beltrami_cli.flows import DT_SHARE, Flow, stability_bound, typical_slope
 from beltrami_cli.grid import Grid
+from beltrami_cli.levelset import two_values
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import what_happened
 from beltrami_cli.sampling import surface_mesh
@@ -159,9 +160,8 @@ def band_of(psi: np.ndarray | None, settings: Settings, plane: PlaneLast, warnin
 
 def _signed(psi: np.ndarray, settings: Settings, warnings: Warnings) -> np.ndarray:
     """Psi with its negative side inside; a binary mask is centred on 0."""
-    finite = psi[np.isfinite(psi)]
-    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 0.0)
-    if low < high and np.all((finite == low) | (finite == high)):
+    if mask := two_values(psi):
+        low, high = mask
         warnings.add(
             f"the level set holds two values only ({low:g} and {high:g}): a mask, whose surface is a staircase of "
             "voxels, accurate to half a voxel; give a signed distance or another smooth function for a better one"

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from command import ball, nifti, noisy
 from hypothesis import settings
 
 # The same examples in every run, and no deadline: the first example of a kernel pays for its compilation.
@@ -18,3 +19,13 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("the real volumes are not here")
     return SHARED_DATA
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """LEVELSET, DATA and OUT: a ball of 5 voxels with noise of 10 around 50."""
+    return (
+        nifti(tmp_path / "psi.nii.gz", ball()),
+        nifti(tmp_path / "data.nii.gz", noisy()),
+        tmp_path / "out.nii.gz",
+    )

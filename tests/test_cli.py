@@ -38,16 +38,6 @@ CHOICES = {
 }
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> tuple[Path, Path, Path]:
-    """LEVELSET, DATA and OUT: a ball of 5 voxels with noise of 10 around 50."""
-    return (
-        nifti(tmp_path / "psi.nii.gz", ball()),
-        nifti(tmp_path / "data.nii.gz", noisy()),
-        tmp_path / "out.nii.gz",
-    )
-
-
 def process(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "beltrami_cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)

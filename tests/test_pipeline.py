@@ -59,16 +59,6 @@ def ply(path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
     return mesh, np.asarray(mesh.metadata["_ply_raw"]["vertex"]["data"]["value"]).reshape(-1)
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> tuple[Path, Path, Path]:
-    """LEVELSET, DATA and OUT: a ball of 5 voxels with noise of 10 around 50."""
-    return (
-        nifti(tmp_path / "psi.nii.gz", ball()),
-        nifti(tmp_path / "data.nii.gz", noisy()),
-        tmp_path / "out.nii.gz",
-    )
-
-
 # World
 
 

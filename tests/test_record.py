@@ -20,16 +20,6 @@ PARAMETERS = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> tuple[Path, Path, Path]:
-    """LEVELSET, DATA and OUT: a ball of 5 voxels with noise of 10 around 50."""
-    return (
-        nifti(tmp_path / "psi.nii.gz", ball()),
-        nifti(tmp_path / "data.nii.gz", noisy()),
-        tmp_path / "out.nii.gz",
-    )
-
-
 def test_provenance(scene, tmp_path):
     levelset, data, out = scene
     done("denoise", levelset, data, "-o", out)
