@@ -9,11 +9,12 @@ __version__ = "0.1.0"
 __all__ = ["Result", "__version__", "denoise"]
 
 if TYPE_CHECKING:
-    from beltrami_cli.solver import Result, denoise
+    from beltrami_cli.api import denoise
+    from beltrami_cli.solver import Result
 
 
 def __getattr__(name: str) -> Any:
     """Import the numerics on first use, so that `import beltrami_cli` and `beltrami --help` stay light (PEP 562)."""
     if name in __all__:
-        return getattr(import_module("beltrami_cli.solver"), name)
+        return getattr(import_module("beltrami_cli.api"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

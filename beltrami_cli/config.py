@@ -16,11 +16,15 @@ import numpy as np
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.extension import EXTENSIONS
 from beltrami_cli.flows import FLOWS, PHI_LAWS, SCHEMES
+from beltrami_cli.kinds import KINDS
 
 LAWS = ("linear", "geometric")
+STOPS = ("auto", "discrepancy", "decorrelation")
 DEFAULT_ITERATIONS = 20  # as in every example of the paper
 MOST_ITERATIONS = 10_000_000  # a typing error: days of work even on the smallest surface
+THINNEST_BAND = 1.5  # half-width in voxels of the largest spacing: a voxel at the surface, and its neighbours
 DEFAULT_BAND = 4.0  # half-width in voxels of the largest spacing: the local cubic's stencil is whole inside it
+MOST_STEPS = 1000  # where the data end the run: at the default dt a Gaussian of about 40 voxels FWHM, 50 on a curve
 FWHM_TO_TIME = 1 / (16 * math.log(2))  # heat flow for t mm^2 is a Gaussian of FWHM sqrt(16 ln 2 t) mm
 
 
@@ -91,30 +95,79 @@ def parse_beta(given: Any) -> Beta:
     return Beta(values, law)
 
 
+def parse_period(given: Any) -> float:
+    """The period of circular data, in their own unit, from a number, "360", "pi" or "2pi".
+
+    Raises RefusedError for anything else, and for a period that is not finite and above 0.
+    """
+    try:
+        if isinstance(given, str) and given.strip().endswith("pi"):
+            period = float(given.strip().removesuffix("pi").strip() or 1) * math.pi
+        else:
+            (period,) = _numbers(given)
+    except (TypeError, ValueError):
+        period = math.nan
+    if not (math.isfinite(period) and period > 0):
+        raise RefusedError(f"period: found {given!r}; expected a number above 0 in the unit of DATA: 360, 24, 2pi ...")
+    return period
+
+
+def parse_depth(given: Any) -> tuple[float, float]:
+    """(A, B) in mm along the normal, A <= B, from "A:B" or a list of two; raises RefusedError for anything else."""
+    try:
+        first, last = _numbers(given.split(":") if isinstance(given, str) else given)
+    except (TypeError, ValueError):
+        first = last = math.nan
+    if not (math.isfinite(first) and math.isfinite(last) and first <= last):
+        raise RefusedError(
+            f"depth: found {given!r}; expected A:B in mm along the normal, A no larger than B, as in -2:2"
+        )
+    return first, last
+
+
 @dataclass(frozen=True)
 class Settings:
     """How to denoise: everything but the files. Raises RefusedError where values or their combination make no sense.
 
-    flow, phi, scheme: names in `flows`. beta: see `parse_beta`; eps: data units per mm, for l1 and tv (beta = 1/eps).
-    dt: mm^2, None for 0.9 of the stability bound. iterations, time (mm^2), fwhm (mm): at most one of them.
+    flow: a name in `flows`, or "auto" to choose with the data; phi, scheme: names in `flows`. beta: see `parse_beta`;
+    edge: the slope (data units per mm) that counts as one, beta = 1/edge; eps: data units per mm, for l1 and tv
+    (beta = 1/eps). fidelity: L of the term L w (U0 - U), 1/mm^2.
+    dt: mm^2, None for 0.9 of the stability bound. iterations, time (mm^2), fwhm (mm), stop: at most one of them.
+    stop: a name in STOPS, the rule by which the data end the run; noise_sigma: standard deviation of the noise in data
+    units, for "discrepancy", None for an estimate. seed: of all that is drawn.
+    kind: a name in `kinds`; period: of circular data, in their unit, see `parse_period`; independent: a vector's
+    channels run apart. missing: a data value that means none (NaN always does). fill: how far along the surface from
+    valid data values are filled in, mm, None for all of a bank that holds any.
     extension: a name in `extension`; extend_every: steps between re-extensions, 0 for never, None for the default.
-    band: half-width in mm, None for 4 voxels of the largest spacing. inside: the sign of Psi inside.
-    outside: what OUT holds beyond the band. precision: of computation and OUT. threads: None for all that it may use.
-    flat: no surface, P = I (Eqs. 10-11).
+    depth: (A, B) mm along the normal over which data are averaged before the flow, see `parse_depth`.
+    band: half-width in mm, None for 4 voxels of the largest spacing, or more if depth asks for it. inside: the sign of
+    Psi inside. outside: what OUT holds beyond the band. precision: of computation and OUT. threads: None for all that
+    it may use. flat: no surface, P = I (Eqs. 10-11).
     """
 
     flow: str = "beltrami"
     phi: str | None = None
     beta: Beta = field(default_factory=Beta)
+    edge: float | None = None
     eps: float | None = None
     scheme: str = "symmetric"
     flat: bool = False
+    fidelity: float | None = None
     dt: float | None = None
     iterations: int | None = None
     time: float | None = None
     fwhm: float | None = None
+    stop: str | None = None
+    noise_sigma: float | None = None
+    seed: int = 0
+    kind: str = "scalar"
+    period: float | None = None
+    independent: bool = False
+    missing: float | None = None
+    fill: float | None = None
     extension: str = "closest-point"
     extend_every: int | None = None
+    depth: tuple[float, float] | None = None
     band: float | None = None
     inside: str = "negative"
     outside: str = "nan"
@@ -123,10 +176,28 @@ class Settings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "beta", parse_beta(self.beta))
+        if self.period is not None:
+            object.__setattr__(self, "period", parse_period(self.period))
+        if self.depth is not None:
+            object.__setattr__(self, "depth", parse_depth(self.depth))
+        self._require_known_names()
+        self._require_numbers()
+        if self.missing is not None and math.isnan(self.missing):
+            object.__setattr__(self, "missing", None)
+        self._require_sensible_flow()
+        self._require_sensible_duration()
+        self._require_sensible_values()
+        self._require_sensible_surface()
+        if self.edge is not None:
+            object.__setattr__(self, "beta", parse_beta(1 / self.edge))
+
+    def _require_known_names(self) -> None:
         for name, known in (
-            ("flow", FLOWS),
+            ("flow", (*FLOWS, "auto")),
             ("phi", (*PHI_LAWS, None)),
             ("scheme", tuple(SCHEMES)),
+            ("stop", (*STOPS, None)),
+            ("kind", KINDS),
             ("extension", EXTENSIONS),
             ("inside", ("negative", "positive")),
             ("outside", ("nan", "zero", "keep")),
@@ -135,28 +206,84 @@ class Settings:
             if getattr(self, name) not in known:
                 names = ", ".join(str(k) for k in known if k is not None)
                 raise RefusedError(f"{name}: found {getattr(self, name)!r}; expected one of {names}")
-        for name, least in (("eps", None), ("dt", None), ("band", None), ("time", 0.0), ("fwhm", 0.0)):
-            _require_number(name, getattr(self, name), least)
-        for name, lowest in (("iterations", 0), ("extend_every", 0), ("threads", 1)):
-            value = getattr(self, name)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, Integral) or value < lowest):
-                raise RefusedError(f"{name}: found {value!r}; expected a whole number of {lowest} or more")
-        self._require_sensible_combination()
+        if not isinstance(self.independent, bool):
+            raise RefusedError(f"independent: found {self.independent!r}; expected true or false")
 
-    def _require_sensible_combination(self) -> None:
-        durations = [n for n in ("iterations", "time", "fwhm") if getattr(self, n) is not None]
-        if len(durations) > 1:
-            raise RefusedError(f"{' and '.join(durations)} both say how long to run; give one of them")
+    def _require_numbers(self) -> None:
+        for name in ("edge", "eps", "dt", "band", "noise_sigma"):
+            _require_number(name, getattr(self, name), None)
+        for name in ("time", "fwhm", "fill", "fidelity"):
+            _require_number(name, getattr(self, name), 0.0)
+        for name, lowest in (("iterations", 0), ("extend_every", 0), ("threads", 1)):
+            if getattr(self, name) is not None:
+                _require_whole(name, getattr(self, name), lowest)
+        _require_whole("seed", self.seed, 0)
+        if self.missing is not None and (not _is_real(self.missing) or math.isinf(self.missing)):
+            raise RefusedError(f"missing: found {self.missing!r}; expected the number that means no value, as -1 or 0")
+
+    def _require_sensible_flow(self) -> None:
+        if self.edge is not None and not self.beta.is_auto and self.beta != Beta((1 / self.edge,)):
+            raise RefusedError("beta and edge both say what counts as an edge (beta = 1/edge); give one of them")
+        named = [name for name in ("phi", "edge", "eps") if getattr(self, name) is not None]
+        named += [] if self.beta.is_auto else ["beta"]
+        if self.flow == "auto" and named:
+            raise RefusedError(f"{named[0]}: the flow auto chooses it with the data; drop it, or name the flow")
         if self.phi is not None and self.flow != "phi":
             raise RefusedError(f"phi: belongs to the flow phi; found the flow {self.flow}; add --flow phi or drop it")
         if self.eps is not None and self.flow not in ("l1", "tv"):
             raise RefusedError(f"eps: belongs to the flows l1 and tv; found the flow {self.flow}, which takes beta")
-        if not self.beta.is_auto and self.flow in ("l1", "tv"):
-            raise RefusedError(f"beta: the flow {self.flow} has none; its edges are set by eps (beta = 1/eps)")
-        if not self.beta.is_auto and self.flow == "l2":
-            raise RefusedError("beta: the flow l2 keeps no edges and has none; drop it, or use --flow beltrami")
+        edges = "beta" if self.edge is None else "edge"
+        if edges in named and self.flow in ("l1", "tv"):
+            raise RefusedError(f"{edges}: the flow {self.flow} has none; its edges are set by eps (beta = 1/eps)")
+        if edges in named and self.flow == "l2":
+            raise RefusedError(f"{edges}: the flow l2 keeps no edges and has none; drop it, or use --flow beltrami")
+
+    def _require_sensible_duration(self) -> None:
+        durations = [n for n in ("iterations", "time", "fwhm", "stop") if getattr(self, n) is not None]
+        if len(durations) > 1:
+            raise RefusedError(f"{' and '.join(durations)} both say how long to run; give one of them")
+        if self.noise_sigma is not None and self.stop != "discrepancy":
+            raise RefusedError(
+                f"noise_sigma: belongs to the stop discrepancy; found the stop {self.stop or 'none'}; "
+                "add --stop discrepancy or drop it"
+            )
+        if self.stop is not None and len(self.beta.values) > 1:
+            raise RefusedError(
+                f"beta: found {self.beta} with the stop {self.stop}; a schedule runs over a known number of "
+                "iterations: give one beta, or --iterations in place of --stop"
+            )
+        if self.stop == "decorrelation" and self.flow not in ("l2", "tv", "phi"):
+            raise RefusedError(
+                f"stop: decorrelation is for flows that keep the mean, l2, tv and phi; found the flow {self.flow}; "
+                "use --stop auto or discrepancy"
+            )
+        if self.stop == "decorrelation" and self.fidelity:
+            raise RefusedError(
+                "stop: decorrelation is for flows that keep the mean, which fidelity does not; "
+                "drop --fidelity, or use --stop auto or discrepancy"
+            )
+
+    def _require_sensible_values(self) -> None:
+        if self.kind == "circular" and self.period is None:
+            raise RefusedError("period: missing for the kind circular; give the value of a whole turn, as --period 360")
+        if self.kind != "circular" and self.period is not None:
+            raise RefusedError(
+                f"period: belongs to the kind circular; found the kind {self.kind}; add --kind circular or drop it"
+            )
+        if self.independent and self.kind != "vector":
+            raise RefusedError(
+                f"independent: belongs to the kind vector; found the kind {self.kind}; add --kind vector or drop it"
+            )
+
+    def _require_sensible_surface(self) -> None:
+        if self.flat and self.depth is not None:
+            raise RefusedError("depth: runs along the normal of a surface; found flat, which has none; drop it")
         if self.flat and (self.band is not None or self.extension != "closest-point" or self.extend_every):
             raise RefusedError("flat: without a surface there is no band and no extension; drop those options")
+        if self.depth is not None and self.extension != "closest-point":
+            raise RefusedError(
+                f"depth: belongs to the extension closest-point; found {self.extension}; drop one of the two"
+            )
 
     @property
     def phi_name(self) -> str:
@@ -172,17 +299,33 @@ class Settings:
         return 0 if self.extension == "none" else 5
 
     def half_width(self, spacing: np.ndarray) -> float:
-        """Half-width of the band in mm on voxels of `spacing` (axes with more than one voxel); RefusedError if thin."""
+        """Half-width of the band in mm on voxels of `spacing` (axes with more than one voxel).
+
+        Raises RefusedError where the one given is too thin for the voxels or the depth.
+        """
         widest = float(spacing.max())
-        if self.band is not None and self.band < 1.5 * widest:
+        reach = 0.0 if self.depth is None else max(map(abs, self.depth))
+        if self.band is None:
+            return max(DEFAULT_BAND * widest, reach + THINNEST_BAND * widest)
+        if self.band < THINNEST_BAND * widest:
             raise RefusedError(
-                f"band: found a half-width of {self.band:g} mm; expected at least 1.5 voxels of the largest spacing "
-                f"({1.5 * widest:g} mm) so that the surface's own voxels have neighbours in it"
+                f"band: found a half-width of {self.band:g} mm; expected at least {THINNEST_BAND} voxels of the "
+                f"largest spacing ({THINNEST_BAND * widest:g} mm) so that the surface's voxels have neighbours in it"
             )
-        return DEFAULT_BAND * widest if self.band is None else self.band
+        if self.depth is not None and self.band < reach:
+            raise RefusedError(
+                f"band: found a half-width of {self.band:g} mm; expected at least {reach:g} mm to hold the depth "
+                f"{self.depth[0]:g}:{self.depth[1]:g}; widen it, or drop it for a band that does"
+            )
+        return self.band
 
     def duration(self, dt: float) -> tuple[int, float, str]:
-        """(iterations, dt in mm^2, what ends the run); a given time is met exactly, by a dt no larger than given."""
+        """(iterations, dt in mm^2, what ends the run); a given time is met exactly, by a dt no larger than given.
+
+        Where the data end the run, the iterations are the most that it may take.
+        """
+        if self.stop is not None:
+            return MOST_STEPS, dt, self.stop
         if self.time is None and self.fwhm is None:
             iterations = DEFAULT_ITERATIONS if self.iterations is None else self.iterations
             _require_countable("iterations", iterations)
@@ -198,10 +341,18 @@ class Settings:
 def _require_number(name: str, value: Any, least: float | None) -> None:
     if value is None:
         return
-    number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    if not number or (value < least if least is not None else value <= 0):
+    if not _is_real(value) or not math.isfinite(value) or (value < least if least is not None else value <= 0):
         wanted = "above 0" if least is None else f"of {least:g} or more"
         raise RefusedError(f"{name}: found {value!r}; expected a finite number {wanted}")
+
+
+def _require_whole(name: str, value: Any, lowest: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < lowest:
+        raise RefusedError(f"{name}: found {value!r}; expected a whole number of {lowest} or more")
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _require_countable(name: str, iterations: float) -> None:
@@ -213,12 +364,19 @@ def _require_countable(name: str, iterations: float) -> None:
 
 @dataclass(frozen=True)
 class Job:
-    """One run: which files, and how. mesh: None for one beside the volume, () for none."""
+    """One run: which files, and how. mesh: None for one beside the volume, () for none.
+
+    weights: how much each data voxel counts (>= 0); mask: which data voxels count at all (not 0). filled: where the
+    mask of the voxels that the run filled in is written.
+    """
 
     data: Path
     volume: Path
     levelset: Path | None = None
     mesh: tuple[Path, ...] | None = None
+    weights: Path | None = None
+    mask: Path | None = None
+    filled: Path | None = None
     spacing: tuple[float, ...] | None = None
     resample: bool = False
     overwrite: bool = False
@@ -236,16 +394,25 @@ class Job:
 
     @property
     def inputs(self) -> list[Path]:
+        """LEVELSET (if any) and DATA."""
         return [path for path in (self.levelset, self.data) if path is not None]
+
+    @property
+    def all_inputs(self) -> list[Path]:
+        """LEVELSET and DATA, then weights and mask: those there are."""
+        return [*self.inputs, *(path for path in (self.weights, self.mask) if path is not None)]
 
 
 # What a config file may say: section, key and the field of Job or Settings that it sets.
 KEYS: dict[str, dict[str, str]] = {
-    "input": {k: k for k in ("levelset", "data", "spacing", "resample", "inside")},
-    "output": {k: k for k in ("volume", "mesh", "outside", "overwrite", "precision")},
-    "flow": {"name": "flow", **{k: k for k in ("phi", "beta", "eps", "scheme", "dt", "flat")}},
-    "time": {k: k for k in ("iterations", "time", "fwhm")},
-    "band": {"half_width": "band", **{k: k for k in ("extension", "extend_every")}},
+    "input": {
+        k: k for k in ("levelset", "data", "weights", "mask", "missing", "fill", "spacing", "resample", "inside")
+    },
+    "output": {k: k for k in ("volume", "mesh", "filled", "outside", "overwrite", "precision")},
+    "flow": {"name": "flow", **{k: k for k in ("phi", "beta", "edge", "eps", "scheme", "dt", "flat", "fidelity")}},
+    "time": {k: k for k in ("iterations", "time", "fwhm", "stop", "noise_sigma", "seed")},
+    "band": {"half_width": "band", **{k: k for k in ("extension", "extend_every", "depth")}},
+    "values": {k: k for k in ("kind", "period", "independent")},
     "run": {"threads": "threads"},
 }
 
@@ -289,15 +456,24 @@ def make_job(given: Mapping[str, Any]) -> Job:
 def overlaid(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of `over` in place of those of `base`; what they displace goes with them.
 
-    One way to say how long to run displaces the others, another flow the old one's parameters, flat all of the surface.
+    One way to say how long to run displaces the others, beta displaces edge and the reverse, another flow or kind the
+    old one's parameters, flat all of the surface.
     """
-    durations = {"iterations", "time", "fwhm"}
-    displaced = durations if durations & over.keys() else set()
+    displaced: set[str] = set()
+    durations = {"iterations", "time", "fwhm", "stop"}
+    if durations & over.keys():
+        displaced |= durations | ({"noise_sigma"} if over.get("stop") != "discrepancy" else set())
+    if {"beta", "edge"} & over.keys():
+        displaced |= {"beta", "edge"}
     if "flow" in over:
-        takes = {"l2": set(), "l1": {"eps"}, "tv": {"eps"}, "phi": {"phi", "beta"}}.get(over["flow"], {"beta"})
-        displaced = displaced | ({"phi", "beta", "eps"} - takes)
+        slopes = {"beta", "edge"}
+        takes = {"l2": set(), "auto": set(), "l1": {"eps"}, "tv": {"eps"}, "phi": {"phi", *slopes}}
+        displaced |= {"phi", "eps", *slopes} - takes.get(over["flow"], slopes)
+    if "kind" in over:
+        own = {"circular": "period", "vector": "independent"}.get(over["kind"])
+        displaced |= {"period", "independent"} - {own}
     if over.get("flat"):
-        displaced = displaced | {"levelset", "mesh", "resample", "band", "extension", "extend_every"}
+        displaced |= {"levelset", "mesh", "resample", "band", "extension", "extend_every", "depth"}
     return {**{k: v for k, v in base.items() if k not in displaced}, **over}
 
 
@@ -323,7 +499,7 @@ def _numbers(given: Any) -> tuple[float, ...]:
 def _from_toml(path: Path, section: str, key: str, value: Any) -> Any:
     """A TOML value as its field holds it."""
     where = f"{path}: [{section}] {key}"
-    if key in ("resample", "overwrite", "flat"):
+    if key in ("resample", "overwrite", "flat", "independent"):
         if not isinstance(value, bool):
             raise RefusedError(f"{where}: found {value!r}; expected true or false")
         return value
@@ -332,7 +508,7 @@ def _from_toml(path: Path, section: str, key: str, value: Any) -> Any:
             return ()
         names = value if isinstance(value, list) else [value]
         return tuple(_path(path, where, name) for name in names)
-    if key in ("levelset", "data", "volume"):
+    if key in ("levelset", "data", "weights", "mask", "volume", "filled"):
         return _path(path, where, value)
     if key == "spacing":
         return parse_spacing(value)

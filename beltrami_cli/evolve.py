@@ -9,12 +9,14 @@ import numpy as np
 
 from beltrami_cli.errors import NumericsError
 
-# u (E,), out (E,), beta, dt -> (root mean square change, energy)
+# u (K, E), out (K, E), beta, dt -> (root mean square change, energy)
 Step = Callable[[np.ndarray, np.ndarray, float, float], tuple[float, float]]
-# u (E,), out (E,)
+# u (K, E), out (K, E)
 Extend = Callable[[np.ndarray, np.ndarray], None]
 # iteration from 1, iterations in all, root mean square change of the last step
 Observer = Callable[[int, int, float], None]
+# iterations done, u (K, E) -> why to stop here, or None to go on
+Stop = Callable[[int, np.ndarray], str | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +34,16 @@ class Schedule:
 
 @dataclass(frozen=True, eq=False)
 class Evolution:
-    """Where the loop ended. values: (E,). change, energy: (K,), one per iteration done."""
+    """Where the loop ended. values: (K, E). change, energy: (N,), one per iteration done."""
 
     values: np.ndarray
     change: np.ndarray
     energy: np.ndarray
     stop_reason: str
+
+    @property
+    def iterations(self) -> int:
+        return len(self.change)
 
 
 def evolve(
@@ -47,24 +53,31 @@ def evolve(
     extend: Extend | None = None,
     extend_every: int = 5,
     observer: Observer | None = None,
+    stop: Stop | None = None,
 ) -> Evolution:
-    """Run `step` over the schedule from u0 (E,), re-extending after every `extend_every` steps (0: never).
+    """Run `step` over the schedule from u0 (K, E), re-extending after every `extend_every` steps (0: never).
 
+    stop: asked before the first iteration and after each, may end the run before the schedule does.
     Raises NumericsError at the first iteration whose values are no longer finite.
     """
     u, out = u0.copy(), np.empty_like(u0)
-    change, energy = np.empty(schedule.iterations), np.empty(schedule.iterations)
-    for k, beta in enumerate(schedule.beta):
-        change[k], energy[k] = step(u, out, float(beta), schedule.dt)
+    change, energy = [], []
+    reason = stop(0, u) if stop is not None else None
+    for k, beta in enumerate(schedule.beta if reason is None else ()):
+        moved, held = step(u, out, float(beta), schedule.dt)
         u, out = out, u
-        if not (np.isfinite(change[k]) and np.isfinite(energy[k])):
+        if not (np.isfinite(moved) and np.isfinite(held)):
             raise NumericsError(
-                f"the flow left the finite numbers at iteration {k + 1}: change {change[k]}, energy {energy[k]}; "
+                f"the flow left the finite numbers at iteration {k + 1}: change {moved}, energy {held}; "
                 "expected finite values (is DATA scaled beyond float32? try --precision float64)"
             )
+        change.append(moved)
+        energy.append(held)
         if extend is not None and extend_every and (k + 1) % extend_every == 0:
             extend(u, out)
             u, out = out, u
         if observer is not None:
-            observer(k + 1, schedule.iterations, float(change[k]))
-    return Evolution(u, change, energy, schedule.ends_by)
+            observer(k + 1, schedule.iterations, moved)
+        if stop is not None and (reason := stop(k + 1, u)) is not None:
+            break
+    return Evolution(u, np.array(change), np.array(energy), reason or schedule.ends_by)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,11 +14,13 @@ from beltrami_cli.kernels import interpolate
 
 EXTENSIONS = ("closest-point", "pde", "none")
 
-# Trilinear weight that valid corners must hold for a value to count as known: one corner's mean share.
+# Trilinear weight that valid corners must hold for a sample to count: one corner's mean share.
 LEAST_WEIGHT = 0.125
 # Voxels to either side of the surface at which data are sampled: the two samples share no corner along the normal, and
 # lie within the voxels that the surface passes through or beside.
 HALF_STEP = 0.5
+# Voxels between the samples of an average over depth: every voxel on the way is met by one or two of them.
+DEPTH_STEP = 0.5
 # A voxel on one side of two banks belongs to the nearer one where it is nearer by this many voxels: less is within the
 # accuracy of a level set between two banks.
 MIDWAY = 0.5
@@ -31,43 +34,56 @@ FILL_ITERATIONS = 100
 class Extended:
     """Start values on the band.
 
-    values: (E,), NaN only on a bank without any valid data. known: (E,) bool, False where a hole was filled.
+    values: (K, E), NaN only on a bank without any valid data. known: (E,) bool, False where a hole was filled.
+    confidence: (E,) in 0..1, mean weight of the data that an entry's value comes from; 0 where it was filled.
     """
 
     values: np.ndarray
     known: np.ndarray
+    confidence: np.ndarray
 
 
-def extend(band: Band, samples: np.ndarray, method: str = "closest-point") -> Extended:
+def extend(
+    band: Band,
+    own: np.ndarray,
+    confidence: np.ndarray,
+    method: str = "closest-point",
+    *,
+    depth: tuple[float, float] | None = None,
+    turns: bool = False,
+) -> Extended:
     """Carry data off the surface on every sheet.
 
-    samples: (E,), a volume's values at the entries (`Band.gather`), NaN where missing; only primary entries count.
+    own: (K, E), the data at the entries that they belong to (`own_samples`), NaN where missing. confidence: (E,) their
+    weights in 0..1, 0 where missing.
     method: "closest-point" (each entry takes the value of valid voxels at its closest surface point, see
     `at_closest_points`), "pde" (U_t + sign(Psi) grad U . grad Psi = 0, Sec. 2.1) or "none" (each voxel keeps its own
     value; sheets other than the nearest take the closest point's). Holes are then filled from the band around them.
+    depth: (A, B) in mm along the normal, for "closest-point": data are averaged from A to B. turns: the channels are cos
+    and sin of an angle, on which nothing may depend on where the angle is 0.
     Raises DataError where no entry is reached by valid data.
     """
     if band.surface is None:
-        values = samples.copy()
+        values, trust = own.copy(), confidence.copy()
     elif method == "pde":
-        values = transported(band, own_samples(band, samples))
+        values, trust = transported(band, own, confidence)
     else:
-        values = at_closest_points(band, own_samples(band, samples))
+        values, trust = at_closest_points(band, own, confidence, _depths(band, depth))
         if method == "none":
-            values[band.primary] = samples[band.primary]
-    known = ~np.isnan(values)
+            values[:, band.primary], trust[band.primary] = own[:, band.primary], confidence[band.primary]
+    known = trust > 0
     if not known.any():
         raise DataError(
-            "the data have no valid value on the surface: found only NaN beside the zero level, expected finite values "
-            "there (do LEVELSET and DATA belong together?)"
+            "the data have no valid value on the surface: found only NaN (or weights of 0) beside the zero level, "
+            "expected finite values there (do LEVELSET and DATA belong together?)"
         )
     if not known.all():
-        fill(band, values, known)
-    return Extended(values, known)
+        fill(band, values, known, turns=turns)
+    return Extended(values, known, trust)
 
 
 def own_samples(band: Band, samples: np.ndarray) -> np.ndarray:
-    """(E,) samples at the entries that a voxel's data belong to; NaN at those of the banks behind the nearest.
+    """(K, E) samples (K, E) at the entries that a voxel's data belong to; NaN at those of the banks behind the nearest.
 
     A voxel midway between two banks feeds neither: which of them it shows is anyone's guess.
     """
@@ -77,60 +93,87 @@ def own_samples(band: Band, samples: np.ndarray) -> np.ndarray:
     near, far = band.distance[first], band.distance[second]
     contested = shared & (near * far > 0) & (np.abs(far) - np.abs(near) < MIDWAY * band.finest)
     own = np.full_like(samples, np.nan)
-    own[first] = np.where(contested, np.nan, samples[first])
+    own[:, first] = np.where(contested, np.nan, samples[:, first])
     return own
 
 
-def at_closest_points(band: Band, own: np.ndarray) -> np.ndarray:
-    """(E,) values of `own` (E,) at each entry's closest point; NaN where valid corners are too few.
+def _depths(band: Band, depth: tuple[float, float] | None) -> np.ndarray:
+    """mm along the normal at which data are sampled."""
+    if depth is None:
+        return np.array([-HALF_STEP, HALF_STEP]) * band.finest
+    low, high = depth
+    return np.linspace(low, high, 1 + math.ceil((high - low) / (DEPTH_STEP * band.finest) - 1e-6))
 
-    The mean of two trilinear samples HALF_STEP voxels on either side along the normal: exact for values linear in
-    depth, and with less noise than one sample at the point itself.
+
+def at_closest_points(
+    band: Band, own: np.ndarray, confidence: np.ndarray, depths: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K, E) values at each entry's closest point, the mean of trilinear samples `depths` (D,) mm along its normal.
+
+    Weighted by confidence (E,), whose mean is returned too: 0, and a value of NaN, where valid corners are too few. Two
+    samples half a voxel to either side are exact for values linear in depth, with less noise than one at the point.
     """
     start = np.arange(band.entries, dtype=np.int32)
-    aside = (HALF_STEP * band.finest * band.normal / band.grid.spacing[:, None]).astype(np.float32)
-    above, below = np.full_like(own, np.nan), np.full_like(own, np.nan)
-    for out, offset in ((above, band.closest_offset + aside), (below, band.closest_offset - aside)):
-        interpolate.linear(own, start, offset, band.forward, band.backward, LEAST_WEIGHT, out)
-    lone = np.where(np.isnan(above), below, above)
-    mean = (above + below) / 2
-    return np.where(np.isnan(mean), lone, mean)
+    total, mass = np.zeros(own.shape), np.zeros(band.entries)
+    along = band.normal / band.grid.spacing.astype(np.float32)[:, None]
+    for depth in depths:
+        offset = band.closest_offset + np.float32(depth) * along
+        interpolate.linear(own, confidence, start, offset, band.forward, band.backward, LEAST_WEIGHT, total, mass)
+    with np.errstate(invalid="ignore"):
+        return (total / mass).astype(own.dtype), (mass / len(depths)).astype(own.dtype)
 
 
-def transported(band: Band, own: np.ndarray) -> np.ndarray:
-    """(E,) solution of the initial value problem of Sec. 2.1, run for twice the time that a front takes to the rim."""
+def transported(band: Band, own: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(K, E) solution of the initial value problem of Sec. 2.1, run for twice the time that a front takes to the rim.
+
+    Confidence (E,), and values times it, are carried alike; returns (values, confidence).
+    """
     spacing = band.grid.spacing
     # mm at unit speed: the upwind scheme's own bound, with a margin
     dt = 0.9 / np.sqrt((1 / band.grid.used_spacing**2).sum())
-    u, out = own.copy(), np.empty_like(own)
-    for _ in range(int(np.ceil(2 * band.half_width / dt))):
-        kernels.transport(u, band.normal, band.distance, band.forward, band.backward, spacing, band.finest, dt, out)
-        u, out = out, u
-    return u
+    carried = []
+    for quantity in (*(confidence * own), np.where(confidence > 0, confidence, np.nan)):
+        u, out = quantity.astype(own.dtype), np.empty_like(own[0])
+        for _ in range(int(np.ceil(2 * band.half_width / dt))):
+            kernels.transport(u, band.normal, band.distance, band.forward, band.backward, spacing, band.finest, dt, out)
+            u, out = out, u
+        carried.append(u)
+    *values, trust = carried
+    return np.stack(values) / trust, np.nan_to_num(trust)
 
 
-def fill(band: Band, values: np.ndarray, known: np.ndarray) -> None:
-    """Fill unknown entries in place with the harmonic function in the band that meets the known ones at the hole's rim.
+def fill(band: Band, values: np.ndarray, known: np.ndarray, *, turns: bool = False) -> None:
+    """Fill unknown entries of values (K, E) in place with the function harmonic in the band that meets the known ones.
 
     Conjugate gradients on the Laplacian over the band's links, started from a ring-by-ring flood; no value leaves the
-    range of the known ones. Banks without any known value stay NaN.
+    range of the known ones (no angle's vector, with `turns`, their length). Banks without any known value stay NaN.
     """
     kernels.flood(values, band.forward, band.backward)
-    free = np.flatnonzero(~known & ~np.isnan(values)).astype(np.int32)
+    free = np.flatnonzero(~known & ~np.isnan(values[0])).astype(np.int32)
     u = np.nan_to_num(values.astype(np.float64), nan=0.0)
     kernels.relax(u, free, band.forward, band.backward, band.grid.spacing, FILL_TOLERANCE, FILL_ITERATIONS)
-    values[free] = np.clip(u[free], values[known].min(), values[known].max())
+    inside = u[:, free]
+    if turns:
+        inside /= np.maximum(np.sqrt((inside**2).sum(0)), 1)
+    else:
+        inside = np.clip(inside, values[:, known].min(1, keepdims=True), values[:, known].max(1, keepdims=True))
+    values[:, free] = inside
 
 
 class Reextension:
-    """Makes values constant along normals again: the local cubic at each entry's closest point, on its own sheet."""
+    """Makes values constant along normals again: the local cubic at each entry's closest point, on its own sheet.
 
-    def __init__(self, band: Band) -> None:
-        self.band = band
+    turns: the channels are cos and sin of an angle, whose overshoot is cut in length, not in each channel.
+    """
+
+    def __init__(self, band: Band, *, turns: bool = False) -> None:
+        self.band, self.turns = band, turns
         start = np.arange(band.entries, dtype=np.int32)
         self.origin = interpolate.stencil_origins(start, band.closest_offset, band.forward, band.backward, band.nodes)
 
     def __call__(self, u: np.ndarray, out: np.ndarray) -> None:
-        """Write the re-extended u into out, both (E,); an entry whose stencil is incomplete keeps its value."""
+        """Write the re-extended u into out, both (K, E); an entry whose stencil is incomplete keeps its value."""
         out[:] = u
-        interpolate.cubic(u, self.origin, self.band.closest_offset, self.band.forward, self.band.nodes, out)
+        band = self.band
+        size = np.sqrt((u**2).sum(0)) if self.turns else np.empty(0, u.dtype)
+        interpolate.cubic(u, size, self.origin, band.closest_offset, band.forward, band.nodes, out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -102,9 +103,10 @@ def require_same_grid(first: Grid, first_name: str, second: Grid, second_name: s
 class Volume:
     """Values on a grid.
 
-    data: array of shape `grid.shape`, floating; NaN where there is no value.
+    data: array of shape `grid.shape`, or `grid.shape + (K,)` for K channels or frames; floating, or complex of shape
+        `grid.shape`; NaN where there is no value.
     file_shape: the array shape in the file it came from, or should have in a file: planes and trailing axes of length 1
-        kept.
+        kept, channels last.
     header: what its file format needs to write a volume like this one; opaque outside `formats`.
     """
 
@@ -114,11 +116,28 @@ class Volume:
     header: Any = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if self.data.shape != self.grid.shape:
+        if self.data.shape[:3] != self.grid.shape or self.data.ndim > 4:
             raise ValueError(f"data has shape {self.data.shape}, its grid {self.grid.shape}")
         if not self.file_shape:
             object.__setattr__(self, "file_shape", self.data.shape)
+        if math.prod(self.file_shape) != self.data.size:
+            raise ValueError(f"data has shape {self.data.shape}, {self.file_shape} in a file")
+
+    @property
+    def channels(self) -> int:
+        """How many values, real or complex, a voxel has: K."""
+        return self.data.shape[3] if self.data.ndim == 4 else 1
 
     def with_data(self, data: np.ndarray) -> Volume:
-        """The same grid and header around other values of the same shape."""
-        return Volume(data, self.grid, self.file_shape, self.header)
+        """The same grid and header around other values on it, also where they have more or fewer channels."""
+        count = data.shape[3] if data.ndim == 4 else 1
+        return Volume(data, self.grid, with_channels(self.file_shape, self.channels, count), self.header)
+
+
+def with_channels(file_shape: tuple[int, ...], found: int, wanted: int) -> tuple[int, ...]:
+    """The file shape of `wanted` channels like that of `found` channels: planes stay planes."""
+    if wanted == found:
+        return file_shape
+    # Of three axes, the last holds channels where there are any: a picture of (nx, ny, K).
+    spatial = file_shape[:2] if found > 1 and len(file_shape) == 3 else file_shape[:3]
+    return (*spatial, wanted) if wanted > 1 else spatial

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,46 +18,108 @@ from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import own_samples
 from beltrami_cli.grid import Grid, Volume, require_same_grid
+from beltrami_cli.kinds import kind_of
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import sidecar
 from beltrami_cli.resample import resample
 from beltrami_cli.sampling import surface_mesh
-from beltrami_cli.solver import PlaneLast, Result, Warnings, band_of, require_usable, solve, time_step
+from beltrami_cli.solver import PlaneLast, Result, Solver, Warnings, band_of, require_usable, time_step, without
 from beltrami_cli.surface import Mesh
 
-REMEDY = "--resample brings DATA onto the level set's grid"
+REMEDY = "--resample brings it onto the level set's grid"
 
 
 def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], None] | None = None) -> Result:
     """Denoise files: read, check, denoise, write OUT, mesh and sidecar. Nothing is written unless everything is.
 
     notify: called with each warning as soon as it is known. Raises as `denoise`, and RefusedError, from
-    the headers alone, where an output exists or cannot be written, or the grids differ.
+    the headers alone, where an output exists or cannot be written, or the grids differ. Frames that run independently
+    stream through memory one at a time; the result then holds no data.
     """
-    phases = Phases()
+    phases, warnings = Phases(), Warnings(notify)
     grid = _check_grids(job)
     files = _Files(job, curve=1 in grid.shape)
-    formats.require_writable(job.volume, grid)
-    sources = [file for path in job.inputs for file in formats.input_files(path)]
+    sources = [file for path in job.all_inputs for file in formats.input_files(path)]
     with formats.Stage(files.all, overwrite=job.overwrite, inputs=sources) as stage:
         with phases("numba"):
             kernels.wake()
-        with phases("read"), ThreadPoolExecutor(1) as pool:
+        with ThreadPoolExecutor(1) as pool:
             digests = pool.submit(lambda: [_sha256(path) for path in sources])
-            volume, psi = _read(job)
+            work = _denoise_series if job.settings.independent else _denoise_volume
+            solved, like = work(job, stage, phases, warnings, observer)
             hashes = digests.result()
-        solved = solve(
-            None if psi is None else psi.data, volume.data, volume.grid, job.settings, phases, observer, notify
-        )
         with phases("write"):
-            formats.write_volume(stage.path(job.volume), volume.with_data(solved.data), dtype=job.settings.precision)
+            if job.filled is not None:
+                formats.write_volume(stage.path(job.filled), like.with_data(solved.filled), dtype=np.uint8)
             for path in files.meshes:
                 assert solved.mesh is not None
                 formats.write_mesh(stage.path(path), solved.mesh)
-        record = sidecar(job, sources, files.all, hashes, solved.record, solved.warnings, phases.seconds)
+        record = sidecar(job, sources, files.all, hashes, solved.record, tuple(warnings.lines), phases.seconds)
         stage.path(files.sidecar).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
         stage.commit()
-    return replace(solved, record=record)
+    return replace(solved, record=record, warnings=tuple(warnings.lines))
+
+
+def _denoise_volume(
+    job: Job, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
+) -> tuple[Result, Volume]:
+    """The result, its volume written, and a volume of the grid and header that outputs are to have."""
+    with phases("read"):
+        psi = _read_levelset(job)
+        data = _onto(_read(job, job.data, channels=job.settings.kind == "vector"), psi, job, job.data)
+        if psi is not None and formats.volume_format(job.volume) != formats.volume_format(job.data):
+            data = replace(data, header=psi.header)
+    solver = _solver(job, psi, data.grid, phases, warnings)
+    solved = solver.denoise(data.data, observer)
+    with phases("write"):
+        formats.write_volume(stage.path(job.volume), data.with_data(solved.data), dtype=job.settings.precision)
+    return solved, data
+
+
+def _denoise_series(
+    job: Job, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
+) -> tuple[Result, Volume]:
+    """As `_denoise_volume`, frame by frame."""
+    with phases("read"):
+        psi = _read_levelset(job)
+        series = formats.open_series(
+            job.data, spacing=_spacing_for(job.data, job.spacing), dtype=job.settings.precision, plane=_is_plane(job)
+        )
+    first = Volume(series.frame(0), series.grid)
+    like = replace(series, grid=first.grid) if psi is None else replace(series, grid=psi.grid)
+    solver = _solver(job, psi, like.grid, phases, warnings)
+
+    def frame(t: int) -> np.ndarray:
+        with phases("read"):
+            return _onto(Volume(series.frame(t), series.grid), psi, job, job.data).data
+
+    record: dict[str, Any] = {}
+    at_vertices: list[np.ndarray] = []
+    filled = np.zeros(like.grid.shape, bool)
+    meshes: list[Mesh] = []
+
+    def denoised() -> Iterator[np.ndarray]:
+        for result in solver.denoise_frames(series.count, frame, record, observer):
+            if result.mesh is not None and result.mesh.values is not None:
+                at_vertices.append(result.mesh.values)
+                meshes[:] = [result.mesh]
+            np.logical_or(filled, result.filled, out=filled)
+            yield result.data
+
+    formats.write_series(stage.path(job.volume), like, denoised(), dtype=job.settings.precision)
+    mesh = replace(meshes[0], values=np.stack(at_vertices, -1)) if meshes else None
+    return Result(np.empty(0), mesh, filled, record, ()), Volume(filled, like.grid, header=like.header)
+
+
+def _solver(job: Job, psi: Volume | None, grid: Grid, phases: Phases, warnings: Warnings) -> Solver:
+    with phases("read"):
+        weights, mask = (
+            None if path is None else _onto(_read(job, path), psi, job, path, angles=False).data
+            for path in (job.weights, job.mask)
+        )
+    if mask is not None:
+        mask = np.nan_to_num(mask) >= (0.5 if job.resample else np.finfo(mask.dtype).tiny)
+    return Solver(None if psi is None else psi.data, grid, job.settings, phases, warnings, weights, mask)
 
 
 def mesh_of(
@@ -66,25 +129,30 @@ def mesh_of(
     spacing: tuple[float, ...] | None = None,
     bring: bool = False,
     inside: str = "negative",
+    period: float | None = None,
 ) -> Mesh:
     """The surface of a level set in RAS mm, with the data as they are at its vertices (NaN where missing).
 
-    bring: resample the data onto the level set's grid. Raises as `run`.
+    bring: resample the data onto the level set's grid. period: of data that are angles. Raises as `run`.
     """
     psi = formats.read_volume(levelset, spacing=_spacing_for(levelset, spacing))
     require_usable(psi.grid, str(levelset))
     plane = PlaneLast(psi.grid)
     band = band_of(psi.data, Settings(inside=inside), plane, Warnings(None))
     if data is None:
-        return surface_mesh(band)
-    volume = formats.read_volume(data, spacing=_spacing_for(data, spacing))
+        return surface_mesh(band)[0]
+    flat = 1 in psi.grid.shape
+    volume = formats.read_volume(data, spacing=_spacing_for(data, spacing), channels=True, plane=flat)
     if bring:
-        volume = resample(volume, psi.grid)
+        volume = resample(volume, psi.grid, period=period)
     require_same_grid(psi.grid, f"LEVELSET {levelset}", volume.grid, f"DATA {data}", remedy=REMEDY)
-    mesh = surface_mesh(band, own_samples(band, band.gather(plane.forth(volume.data))))
-    if mesh.values is not None and not np.isfinite(mesh.values).any():
+    kind = kind_of("circular" if period else "vector", volume.data, period)[0]
+    own = own_samples(band, kind.to_channels(band.gather(plane.forth(volume.data))))
+    mesh, values = surface_mesh(band, own, turns=kind.is_circular)
+    assert values is not None
+    if not np.isfinite(values).any():
         raise DataError(f"DATA {data} has no value on the surface: found only NaN there; drop it for a bare mesh")
-    return mesh
+    return replace(mesh, values=kind.at_vertices(values))
 
 
 class _Files:
@@ -96,51 +164,74 @@ class _Files:
             meshes = () if job.settings.flat else (formats.mesh_beside(job.volume, curve=curve),)
         self.meshes = meshes
         written = [file for mesh in meshes for file in formats.mesh_files(mesh, curve=curve)]
+        filled = [] if job.filled is None else formats.volume_files(job.filled)
         stem = formats.stem(job.volume)
         self.sidecar = stem.with_name(stem.name + ".json")
-        self.all = [*formats.volume_files(job.volume), *written, self.sidecar]
+        self.all = [*formats.volume_files(job.volume), *filled, *written, self.sidecar]
 
 
 def _check_grids(job: Job) -> Grid:
-    """The grid to compute on, from headers alone; raises RefusedError where it will not do."""
-    spacing = job.spacing
-    grids = {path: formats.read_grid(path, spacing=_spacing_for(path, spacing)) for path in job.inputs}
-    if spacing is not None and not any(formats.volume_format(path) == "NPY" for path in job.inputs):
+    """The grid to compute on, from headers alone; raises RefusedError where it, or what it is to be written to, will not do."""
+    if job.spacing is not None and not any(formats.volume_format(path) == "NPY" for path in job.all_inputs):
         raise RefusedError("spacing: is for .npy inputs only; found none among LEVELSET and DATA; drop --spacing")
-    grid = grids[job.inputs[0]]
-    if job.levelset is not None and not job.resample:
-        require_same_grid(grid, f"LEVELSET {job.levelset}", grids[job.data], f"DATA {job.data}", remedy=REMEDY)
-    require_usable(grid, str(job.inputs[0]))
+    several = job.settings.kind == "vector"
+    grids: dict[str, tuple[Path, Grid]] = {}
+    for name, path in zip(("LEVELSET", "DATA", "weights", "mask"), (job.levelset, job.data, job.weights, job.mask), strict=True):
+        if path is not None:
+            is_data = name == "DATA"
+            found = formats.read_grid(
+                path, spacing=_spacing_for(path, job.spacing), channels=is_data and several, plane=is_data and _is_plane(job)
+            )
+            grids[name] = path, found
+    first, (where, grid) = next(iter(grids.items()))
+    for name, (path, other) in grids.items():
+        if not job.resample:
+            require_same_grid(grid, f"{first} {where}", other, f"{name} {path}", remedy=REMEDY)
+    require_usable(grid, str(where))
     job.settings.duration(time_step(grid, job.settings))
     if not job.settings.flat:
         job.settings.half_width(grid.used_spacing)
+    layout = formats.read_layout(job.data, plane=_is_plane(job)) if several else (1, False)
+    formats.require_writable(job.volume, grid, channels=layout[0], is_complex=layout[1])
+    if job.filled is not None:
+        formats.require_writable(job.filled, grid)
     return grid
+
+
+def _is_plane(job: Job) -> bool:
+    """True where DATA of three axes are a plane of channels: its level set is one, or it is a picture."""
+    if job.levelset is None:
+        return True
+    return 1 in formats.read_grid(job.levelset, spacing=_spacing_for(job.levelset, job.spacing)).shape
 
 
 def _spacing_for(path: Path, spacing: tuple[float, ...] | None) -> tuple[float, ...] | None:
     return spacing if formats.volume_format(path) == "NPY" else None
 
 
-def _read(job: Job) -> tuple[Volume, Volume | None]:
-    """DATA on the grid to compute on, with the header that OUT is to have, and LEVELSET."""
+def _read(job: Job, path: Path, *, channels: bool = False) -> Volume:
+    return formats.read_volume(
+        path, spacing=_spacing_for(path, job.spacing), dtype=job.settings.precision, channels=channels,
+        plane=channels and _is_plane(job),
+    )  # fmt: skip
 
-    def read(path: Path) -> Volume:
-        return formats.read_volume(path, spacing=_spacing_for(path, job.spacing), dtype=job.settings.precision)
 
-    data = read(job.data)
-    if job.levelset is None:
-        return data, None
-    psi = read(job.levelset)
-    if job.resample and not data.grid.matches(psi.grid):
-        data = replace(resample(data, psi.grid), file_shape=psi.file_shape, header=psi.header)
-        if not np.isfinite(data.data).any():
-            raise DataError(
-                f"{job.data}: has no value on the grid of {job.levelset}: found no overlap in world space, "
-                "expected volumes of one head in one space"
-            )
-    elif formats.volume_format(job.volume) != formats.volume_format(job.data):
-        data = replace(data, header=psi.header)
-    return data, psi
+def _read_levelset(job: Job) -> Volume | None:
+    return None if job.levelset is None else _read(job, job.levelset)
+
+
+def _onto(volume: Volume, psi: Volume | None, job: Job, path: Path, *, angles: bool = True) -> Volume:
+    """The volume on the level set's grid; missing values are not mixed with others on the way."""
+    if psi is None or not job.resample or volume.grid.matches(psi.grid):
+        return volume
+    period = job.settings.period if angles else None
+    moved = resample(replace(volume, data=without(volume.data, job.settings.missing)), psi.grid, period=period)
+    if not np.isfinite(moved.data).any():
+        raise DataError(
+            f"{path}: has no value on the grid of {job.levelset}: found no overlap in world space, "
+            "expected volumes of one head in one space"
+        )
+    return Volume(moved.data, psi.grid, psi.file_shape if moved.channels == 1 else (), psi.header)
 
 
 def _sha256(path: Path) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,71 +17,134 @@ from beltrami_cli import __version__
 from beltrami_cli.band import Band
 from beltrami_cli.config import Job, Settings
 from beltrami_cli.evolve import Evolution, Schedule
+from beltrami_cli.extension import Extended
+from beltrami_cli.flows import Flow
 from beltrami_cli.grid import Grid
+from beltrami_cli.kinds import Kind
+from beltrami_cli.tuning import Choice, near_surface
 
 
-def what_happened(
-    settings: Settings,
-    grid: Grid,
-    band: Band,
-    schedule: Schedule,
-    evolution: Evolution,
-    slope: float,
-    samples: np.ndarray,
-    values: np.ndarray,
-    known: np.ndarray,
-    excess: float,
-) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is to run: chosen once, for all frames of a series alike.
+
+    slope: typical slope of the data; noise: (K,) standard deviations or (1,), data units; choice: None where beta and
+    duration were given.
+    """
+
+    flow: Flow
+    schedule: Schedule
+    slope: float
+    noise: np.ndarray
+    choice: Choice | None
+
+
+@dataclass(frozen=True, eq=False)
+class Ran:
+    """One run on one set of data. own: (K, E) samples of weights trust (E,); values: (K, E) as they came out.
+
+    excess: by how much values had left the range of the data (data units). smoothness: FWHM before and after, mm.
+    """
+
+    kind: Kind
+    own: np.ndarray
+    trust: np.ndarray
+    start: Extended
+    evolution: Evolution
+    substeps: int
+    values: np.ndarray
+    excess: float
+    smoothness: tuple[float, float]
+
+
+def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: Ran) -> dict[str, Any]:
     """What was used and what happened, JSON-ready; lengths mm, dt mm^2, beta mm per data unit."""
-    primary = band.primary
-    near = primary[np.abs(band.distance[primary]) <= 0.5 * grid.spacing.max()]
-    removed = (samples[near] - values[near]).astype(float)
-    removed = removed[np.isfinite(removed)]
-    used = {**asdict(settings), "band": band.half_width, "dt": schedule.dt}
-    used["beta"] = _beta_used(settings, schedule)
-    used["extend_every"] = settings.reextends_every
-    used["iterations"] = schedule.iterations
-    used["threads"] = numba.get_num_threads()
-    used["eps"] = 1 / schedule.beta[0] if settings.flow in ("l1", "tv") and schedule.beta.any() else None
-    used["phi"] = settings.phi_name if settings.flow == "phi" else None
+    primary, schedule, evolution = band.primary, plan.schedule, ran.evolution
+    missing = np.isnan(ran.values[0, primary])
+    near = near_surface(band, ran.trust)
+    near = near[~np.isnan(ran.values[0, near])]
+    beta = schedule.beta[: evolution.iterations]
     return {
-        "Parameters": used,
+        "Parameters": _used(settings, band, plan, evolution, ran.kind),
         "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
         "Band": {
             "voxels": len(primary),
             "entries": band.entries,
             "half_width_mm": band.half_width,
             "surface_vertices": 0 if band.surface is None else len(band.surface.points),
-            "filled_voxels": int((~known[primary] & ~np.isnan(values[primary])).sum()),
-            "missing_voxels": int(np.isnan(values[primary]).sum()),
+            "filled_voxels": int((~ran.start.known[primary] & ~missing).sum()),
+            "missing_voxels": int(missing.sum()),
         },
-        "Iterations": schedule.iterations,
+        "Values": {
+            "channels": len(ran.values),
+            "range": [ran.kind.low, ran.kind.low + ran.kind.period] if ran.kind.is_circular else None,
+        },
+        "Iterations": evolution.iterations,
         "StopReason": evolution.stop_reason,
-        "TimeMm2": schedule.dt * schedule.iterations,
-        "TypicalSlope": slope,
+        "TimeMm2": schedule.dt * evolution.iterations,
+        "TypicalSlope": plan.slope,
+        "Noise": {
+            "sd": [_number(sd) for sd in plan.noise],
+            "meaning": "robust standard deviation of the noise of a voxel on the surface, data units, per channel",
+        },
+        "Smoothness": {
+            "before_mm": _number(ran.smoothness[0]),
+            "after_mm": _number(ran.smoothness[1]),
+            "meaning": "FWHM along the surface of what the values show, map and noise (Forman et al. 1995)",
+        },
         "Removed": {
-            "rms": float(np.sqrt(np.mean(removed**2))) if removed.size else None,
-            "voxels": int(removed.size),
+            "rms": _number(ran.kind.spread(ran.own[:, near], ran.values[:, near])),
+            "voxels": len(near),
             "meaning": "input minus output at valid voxels within half a voxel of the surface",
         },
-        "ClippedExcess": excess,
+        "ClippedExcess": ran.excess,
+        "Choice": None if plan.choice is None else _chosen(plan.choice, ran.kind),
         "PerIteration": {
-            "beta": schedule.beta.tolist(),
-            "dt": [schedule.dt] * schedule.iterations,
-            "dt_over_beta": [schedule.dt / beta if beta else None for beta in schedule.beta.tolist()],
+            "beta": beta.tolist(),
+            "dt": [schedule.dt] * len(beta),
+            "dt_over_beta": [schedule.dt / b if b else None for b in beta.tolist()],
             "change_rms": evolution.change.tolist(),
             "energy": evolution.energy.tolist(),
+            "most_substeps": ran.substeps,
         },
     }
 
 
-def _beta_used(settings: Settings, schedule: Schedule) -> float | str | None:
-    """The number where beta was one, the schedule where it changed, None for a flow that has none."""
-    if settings.flow in ("l2", "l1", "tv"):
-        return None
-    if len(set(schedule.beta.tolist())) == 1:
-        return float(schedule.beta[0])
-    return str(settings.beta)
+def _used(settings: Settings, band: Band, plan: Plan, evolution: Evolution, kind: Kind) -> dict[str, Any]:
+    """Every parameter as used, defaults and choices included."""
+    flow, schedule = plan.flow, plan.schedule
+    has_beta = flow.name in ("beltrami", "phi")
+    one = len(set(schedule.beta.tolist())) == 1
+    return {
+        **asdict(settings),
+        "flow": flow.name,
+        "phi": flow.phi if flow.name == "phi" else None,
+        "beta": (float(schedule.beta[0]) if one else str(settings.beta)) if has_beta else None,
+        "eps": 1 / schedule.beta[0] if flow.name in ("l1", "tv") and schedule.beta.any() else None,
+        "band": band.half_width,
+        "dt": schedule.dt,
+        "extend_every": settings.reextends_every,
+        "iterations": evolution.iterations,
+        "threads": numba.get_num_threads(),
+    }
+
+
+def _chosen(choice: Choice, kind: Kind) -> dict[str, Any]:
+    return {
+        "flow": choice.flow.name,
+        "phi": choice.flow.phi if choice.flow.name == "phi" else None,
+        "beta": choice.beta,
+        "iterations": choice.iterations,
+        "held_out_voxels": choice.held_out,
+        "gain_standard_errors": choice.gain,
+        "meaning": "error: root mean square at the held-out voxels, data units; each row at its best iteration",
+        "table": choice.table(kind),
+    }
+
+
+def _number(value: float) -> float | None:
+    """For JSON, which has no NaN and no infinity."""
+    return float(value) if math.isfinite(value) else None
 
 
 def sidecar(

@@ -1,153 +1,282 @@
-"""From arrays to denoised arrays: check, build the band, extend, evolve, sample the mesh."""
+"""From arrays to denoised arrays: check, build the band, extend, choose, evolve, sample the mesh."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
 import numpy as np
 
 from beltrami_cli.band import Band, build_band, flat_band
-from beltrami_cli.config import Settings, parse_spacing
+from beltrami_cli.config import Settings
+from beltrami_cli.course import Course
 from beltrami_cli.errors import DataError, NumericsError, RefusedError
-from beltrami_cli.evolve import Observer, Schedule, evolve
-from beltrami_cli.extension import Extended, Reextension, extend
+from beltrami_cli.evolve import Observer, Schedule
+from beltrami_cli.extension import Extended, own_samples
 from beltrami_cli.flows import DT_SHARE, Flow, stability_bound, typical_slope
+from beltrami_cli.geodesic import distance_along
 from beltrami_cli.grid import Grid
+from beltrami_cli.kinds import Kind, kind_of
 from beltrami_cli.levelset import two_values
+from beltrami_cli.noise import looks_correlated, noise_sd, smoothness_mm
 from beltrami_cli.progress import Phases
-from beltrami_cli.record import what_happened
+from beltrami_cli.record import Plan, Ran, what_happened
 from beltrami_cli.sampling import surface_mesh
 from beltrami_cli.surface import Mesh
+from beltrami_cli.tuning import LEAST_VOXELS, Choice, Family, choose, decorrelated, discrepancy
 
 # eps of the flows l1 and tv as a share of the data's typical slope: so small that nearly every slope counts as an edge.
 EPS_SHARE = 0.1
 # Parts of the surface without data are worth a warning above this share of the band: below it are lone voxels.
 LONE_SHARE = 1e-3
+# Weights below 0 by no more than this share of the largest are rounding and interpolation.
+NEGATIVE_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
     """What a run gives.
 
-    data: denoised values in the shape of the input, NaN (or what `outside` says) beyond the band.
-    mesh: the surface in RAS mm with the denoised value at every vertex; None for a flat run.
+    data: denoised values in the shape and kind of the input, NaN (or what `outside` says) beyond the band.
+    mesh: the surface in RAS mm with the denoised value at every vertex, (V,) or (V, K); None for a flat run.
+    filled: bool, in the shape of one channel: where a value was filled in.
     record: every parameter as used and what happened, as in the sidecar.
     warnings: lines for the user.
     """
 
     data: np.ndarray
     mesh: Mesh | None
+    filled: np.ndarray
     record: dict[str, Any]
     warnings: tuple[str, ...]
 
 
-def denoise(
-    levelset: np.ndarray | None,
-    data: np.ndarray,
-    *,
-    affine: np.ndarray | None = None,
-    spacing: float | Sequence[float] | None = None,
-    observer: Observer | None = None,
-    **options: Any,
-) -> Result:
-    """Denoise data that lie on the zero level of a level set.
+class Solver:
+    """The band, the weights and the settings that all frames of a run share.
 
-    levelset: Psi, (nx, ny, nz), or (nx, ny) for a curve in a plane; negative inside; None with flat=True.
-    data: values of the same shape, NaN where missing.
-    affine: (4, 4), voxel indices to RAS mm; or spacing: mm, one number or one per axis (default 1).
-    observer: called after every iteration with (iteration, iterations, root mean square change).
-    options: the fields of `config.Settings`, such as flow="beltrami", beta=0.05, iterations=20.
-
-    Raises RefusedError for options or shapes that make no sense, DataError where Psi has no zero level or the data no
-    value on it, NumericsError where values leave the finite numbers (all of `beltrami_cli.errors`).
-
-    The flow is Eq. 20 of "The Beltrami Flow over Implicit Manifolds" on a narrow band with one sheet per bank.
+    psi: (nx, ny, nz), None for a flat run. weights: of the same shape, 0 or more, or None; mask: likewise, which data
+    count (not 0). Raises as `denoise`.
     """
-    for name in options.keys() - {field.name for field in fields(Settings)}:
-        raise RefusedError(f"unknown option {name!r}; the options are the fields of config.Settings")
-    settings = Settings(**options)
-    if isinstance(data, np.ma.MaskedArray):
-        data = np.ma.filled(data.astype(float), np.nan)
-    values = np.asarray(data)
-    if values.ndim not in (2, 3):
-        raise RefusedError(f"data: found an array of shape {values.shape}; expected 2 or 3 axes")
-    if affine is not None and spacing is not None:
-        raise RefusedError("affine and spacing both place the voxels; give one of them")
-    psi = None if levelset is None else np.asarray(levelset)
-    if psi is not None and psi.shape != values.shape:
-        raise RefusedError(f"levelset has shape {psi.shape} and data {values.shape}; expected one shape for both")
-    if settings.flat != (psi is None):
-        raise RefusedError("levelset: expected an array, or None together with flat=True")
-    grid = _grid(values.shape, affine, spacing)
-    threads = numba.get_num_threads()
-    try:
-        solved = solve(
-            None if psi is None else _as_float(psi, settings).reshape(grid.shape),
-            _as_float(values, settings).reshape(grid.shape),
-            grid, settings, Phases(), observer,
-        )  # fmt: skip
-    finally:
-        numba.set_num_threads(threads)  # the caller's own choice
-    return replace(solved, data=solved.data.reshape(values.shape))
 
+    def __init__(
+        self,
+        psi: np.ndarray | None,
+        grid: Grid,
+        settings: Settings,
+        phases: Phases,
+        warnings: Warnings,
+        weights: np.ndarray | None = None,
+        mask: np.ndarray | None = None,
+    ) -> None:
+        require_usable(grid, "the grid")
+        self.grid, self.settings, self.phases, self.warnings = grid, settings, phases, warnings
+        numba.set_num_threads(min(settings.threads or _cpus(), numba.config.NUMBA_NUM_THREADS))
+        iterations, dt, self.ends_by = settings.duration(time_step(grid, settings))
+        self.iterations = iterations
+        self.plane = PlaneLast(grid)
+        trust = _trust(weights, mask, grid, settings, warnings)
+        with phases("band"):
+            self.band = band_of(psi, settings, self.plane, warnings)
+            self.trust = self.band.gather(self.plane.forth(trust))
+            self.course = Course(
+                self.band, Kind(), dt, settings.scheme, settings.extension, settings.depth, settings.reextends_every,
+                settings.fidelity or 0.0,
+            )  # fmt: skip
 
-def _grid(shape: tuple[int, ...], affine: np.ndarray | None, spacing: float | Sequence[float] | None) -> Grid:
-    """The grid of an array; raises RefusedError where affine or spacing cannot place voxels."""
-    if affine is None:
-        steps = (1.0,) if spacing is None else parse_spacing(np.asarray(spacing).tolist())
-        return Grid.from_spacing(shape, steps[0] if len(steps) == 1 else steps)
-    matrix = np.asarray(affine)
-    usable = matrix.shape == (4, 4) and matrix.dtype.kind in "fiu" and np.isfinite(matrix).all()
-    if not usable or np.linalg.det(matrix[:3, :3]) == 0:
-        raise RefusedError(f"affine: found {matrix.tolist()}; expected an invertible 4 x 4 matrix, voxels to RAS mm")
-    return Grid(Grid.from_spacing(shape).shape, matrix.astype(float))
+    def denoise(self, data: np.ndarray, observer: Observer | None = None) -> Result:
+        """Denoise data of shape grid.shape, or grid.shape + (K,) for a vector."""
+        sample = self._sample(data, self.warnings)
+        return self._run(data, sample, self._plan(sample), observer)
 
+    def denoise_frames(
+        self,
+        count: int,
+        frame: Callable[[int], np.ndarray],
+        record: dict[str, Any],
+        observer: Observer | None = None,
+    ) -> Iterator[Result]:
+        """Denoise `count` frames one after another, all with what is chosen on the middle one.
 
-def solve(
-    psi: np.ndarray | None,
-    data: np.ndarray,
-    grid: Grid,
-    settings: Settings,
-    phases: Phases,
-    observer: Observer | None = None,
-    notify: Callable[[str], None] | None = None,
-) -> Result:
-    """Denoise arrays of shape grid.shape; data in that shape come back."""
-    warnings = Warnings(notify)
-    require_usable(grid, "the grid")
-    numba.set_num_threads(min(settings.threads or _cpus(), numba.config.NUMBA_NUM_THREADS))
-    dt = time_step(grid, settings)
-    data = _finite_or_missing(data, warnings)
-    plane = PlaneLast(grid)
-    with phases("band"):
-        band = band_of(psi, settings, plane, warnings)
-        samples = band.gather(plane.forth(data))
-    with phases("extend"):
-        start = extend(band, samples, settings.extension)
-        missing = np.isnan(start.values[band.primary]).mean()
+        frame: its number -> data of shape grid.shape. record: is given the middle one's record, with a list over all.
+        """
+        middle = count // 2
+        plan = self._plan(self._sample(frame(middle), self.warnings))
+        quiet, empty, noise = Warnings(None), [], []
+        for t in range(count):
+            data = frame(t)
+            try:
+                sample = self._sample(data, quiet)
+                result = self._run(data, sample, plan if t == middle else replace(plan, choice=None), observer)
+                noise.append(result.record["Noise"]["sd"][0])
+            except DataError:
+                empty.append(t)
+                noise.append(None)
+                result = self._nothing(data)
+            if t == middle:
+                record.update(result.record)
+            yield result
+        if empty:
+            self.warnings.add(f"{len(empty)} of {count} frames have no valid data on the surface: {empty[:10]}; left missing")
+        record["Frames"] = {"count": count, "chosen_on": middle, "without_data": empty, "noise_sd": noise}
+
+    def _sample(self, data: np.ndarray, warnings: Warnings) -> Sample:
+        """The data as channels on the band; raises DataError where none are valid."""
+        data = _finite_or_missing(data, self.settings.missing, warnings)
+        name = "scalar" if self.settings.independent else self.settings.kind
+        kind, doubt = kind_of(name, data, self.settings.period)
+        if doubt:
+            warnings.add(doubt)
+        with self.phases("extend"):
+            own = own_samples(self.band, kind.to_channels(self.band.gather(self.plane.forth(data))))
+            trust = np.where(np.isnan(own[0]), 0, self.trust).astype(own.dtype)
+            own[:, trust == 0] = np.nan
+            course = replace(self.course, kind=kind)
+            start = course.start(own, trust)
+        missing = np.isnan(start.values[0, self.band.primary]).mean()
         if missing > LONE_SHARE:
             share = f"{100 * missing:.1f} %"
             warnings.add(f"{share} of the band lies on parts of the surface without any data: left missing")
-        u0 = np.where(np.isnan(start.values), 0, start.values)  # linked to nothing but one another
-    flow = Flow(settings.flow, settings.phi_name, settings.scheme)
-    slope = typical_slope(band, u0, start.known)
-    with phases("flow"):
-        schedule = _schedule(settings, dt, slope)
-        every = settings.reextends_every
-        evolution = evolve(
-            u0, flow.stepper(band, u0.dtype), schedule, Reextension(band) if every else None, every, observer
-        )
-        values, excess = _within_range(np.where(np.isnan(start.values), np.nan, evolution.values), start)
-    with phases("mesh"):
-        mesh = None if settings.flat else surface_mesh(band, values)
-    outside: dict[str, np.ndarray | float] = {"nan": np.nan, "zero": 0.0, "keep": plane.forth(data)}
-    out = plane.back(band.scatter(values, outside[settings.outside]))
-    record = what_happened(settings, grid, band, schedule, evolution, slope, samples, values, start.known, excess)
-    return Result(out, mesh, record, tuple(warnings.lines))
+        return Sample(course, own, trust, start)
+
+    def _plan(self, sample: Sample) -> Plan:
+        """Which flow, and its schedule, by the settings and, where they say so, by the data."""
+        settings, course, start = self.settings, sample.course, sample.start
+        slope = typical_slope(self.band, start.values, start.known) * course.kind.unit
+        noise = noise_sd(self.band, sample.own, course.kind)
+        flow = Flow("beltrami" if settings.flow == "auto" else settings.flow, settings.phi_name, settings.scheme)
+        fixed = self._fixed_beta(slope)
+        steps, ends_by, choice = self.iterations, self.ends_by, None
+        if isinstance(fixed, np.ndarray):  # a schedule
+            return Plan(flow, Schedule(fixed, course.dt, ends_by), slope, noise, None)
+        if self._chooses(fixed, sample):
+            with self.phases("choose"):
+                choice = choose(
+                    course, sample.own, sample.trust, self._families(fixed, slope), slope, steps, settings.seed,
+                    stop=settings.stop == "auto",
+                )  # fmt: skip
+            flow, fixed, steps = choice.flow, choice.beta, choice.iterations
+            self._doubt(choice, sample)
+        elif fixed is None:
+            fixed = 1 / slope if slope else 0.0
+        if settings.stop == "decorrelation":
+            with self.phases("choose"):
+                steps = decorrelated(course, start, flow, fixed, steps)
+        return Plan(flow, Schedule(np.full(steps, fixed), course.dt, ends_by), slope, noise, choice)
+
+    def _fixed_beta(self, slope: float) -> np.ndarray | float | None:
+        """beta in mm per data unit, one per iteration where it is a schedule; None where it is to be chosen."""
+        settings = self.settings
+        if settings.flow == "l2":
+            return 0.0
+        if settings.flow in ("l1", "tv"):
+            return self._beta_of_eps(slope)
+        if len(settings.beta.values) > 1:
+            return settings.beta.over(self.iterations)
+        return None if settings.beta.is_auto else settings.beta.values[0]
+
+    def _beta_of_eps(self, slope: float) -> float:
+        eps = self.settings.eps if self.settings.eps is not None else EPS_SHARE * slope
+        return 1 / eps if eps else 0.0
+
+    def _chooses(self, beta: float | None, sample: Sample) -> bool:
+        """True where held-out data are to choose: they cannot without iterations, or beside a rule that needs no beta."""
+        stop = self.settings.stop
+        if stop == "auto":
+            return True
+        if beta is not None or stop is not None or not self.iterations:
+            return False
+        enough = (sample.trust > 0).sum() >= LEAST_VOXELS
+        if not enough and self.settings.flow == "auto":
+            raise DataError(f"flow auto: found fewer than {LEAST_VOXELS} valid voxels to hold some out; name the flow")
+        if not enough:
+            self.warnings.add(f"beta auto: fewer than {LEAST_VOXELS} valid voxels, too few to hold some out: 1 / slope")
+        return bool(enough)
+
+    def _families(self, beta: float | None, slope: float) -> list[Family]:
+        """The flows to try: the one that was named, or all."""
+        settings = self.settings
+        if settings.flow != "auto":
+            return [Family(Flow(settings.flow, settings.phi_name, settings.scheme), beta)]
+        return [
+            Family(Flow("l2", scheme=settings.scheme), 0.0),
+            Family(Flow("beltrami", scheme=settings.scheme), None),
+            Family(Flow("tv", scheme=settings.scheme), self._beta_of_eps(slope)),
+            Family(Flow("phi", "perona-malik", settings.scheme), None),
+        ]
+
+    def _doubt(self, choice: Choice, sample: Sample) -> None:
+        """Warn where held-out data are a poor judge."""
+        way_out = "check the result, or use --stop discrepancy with --noise-sigma"
+        if looks_correlated(self.band, sample.own, sample.course.kind):
+            self.warnings.add(
+                "the noise of neighbouring voxels looks correlated (interpolated, or painted from a mesh): held-out "
+                f"voxels are then predicted from their own copies, and the automatic choice smooths too little; {way_out}"
+            )
+        elif not choice.is_clear:
+            self.warnings.add(
+                "automatic choice: no run predicts the held-out voxels clearly better than the data as they are; "
+                + way_out
+            )
+        if choice.at_end:
+            self.warnings.add(f"the held-out error was still falling after {choice.iterations} iterations; {way_out}")
+
+    def _run(self, data: np.ndarray, sample: Sample, plan: Plan, observer: Observer | None) -> Result:
+        settings, band, course, start = self.settings, self.band, sample.course, sample.start
+        stop = None
+        if settings.stop == "discrepancy":
+            sigma = settings.noise_sigma or float(np.sqrt(np.mean(plan.noise**2)))
+            if not sigma > 0:
+                raise DataError("stop discrepancy: the noise cannot be estimated from these data; give --noise-sigma S")
+            stop = discrepancy(course, sample.own, sample.trust, sigma)
+        with self.phases("flow"):
+            evolution, substeps = course.run(start, plan.flow, plan.schedule, observer, stop)
+            values, excess = _within_range(evolution.values, start, course.kind)
+            if settings.fill is not None and not start.known.all():
+                far = distance_along(band, start.known, settings.fill) > settings.fill
+                values[:, far & ~start.known] = np.nan
+        if stop is not None and not evolution.iterations:
+            self.warnings.add("stop discrepancy: the data differ from their own mean over depth by more than the noise: no flow")
+        with self.phases("mesh"):
+            mesh = None
+            if not settings.flat:
+                mesh, at_vertices = surface_mesh(band, values, turns=course.kind.is_circular)
+                assert at_vertices is not None
+                mesh = replace(mesh, values=course.kind.at_vertices(at_vertices))
+        outside: dict[str, np.ndarray | float] = {"nan": np.nan, "zero": 0.0, "keep": self.plane.forth(data)}
+        out = self.plane.back(band.scatter(course.kind.to_values(values), outside[settings.outside]))
+        filled = ~start.known & ~np.isnan(values[0])
+        smoothness = tuple(smoothness_mm(band, u, course.kind) for u in (sample.own, values))
+        ran = Ran(
+            course.kind, sample.own, sample.trust, start, evolution, substeps, values, excess, smoothness
+        )  # fmt: skip
+        return Result(
+            out, mesh, self.plane.back(band.scatter(filled, 0.0)),
+            what_happened(settings, self.grid, band, plan, ran), tuple(self.warnings.lines),
+        )  # fmt: skip
+
+    def _nothing(self, data: np.ndarray) -> Result:
+        """The result for a frame without data: everything missing."""
+        band = self.band
+        outside = {"nan": np.nan, "zero": 0.0, "keep": self.plane.forth(data)}[self.settings.outside]
+        out = self.plane.back(band.scatter(np.full(band.entries, np.nan, data.dtype), outside))
+        mesh = None
+        if not self.settings.flat:
+            mesh = surface_mesh(band)[0]
+            mesh = replace(mesh, values=np.full(len(mesh.vertices_ras_mm), np.nan, data.dtype))
+        return Result(out, mesh, np.zeros(self.grid.shape, bool), {}, ())
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Data on the band. own: (K, E) samples of weights trust (E,); start: the values that the flow starts from."""
+
+    course: Course
+    own: np.ndarray
+    trust: np.ndarray
+    start: Extended
 
 
 def band_of(psi: np.ndarray | None, settings: Settings, plane: PlaneLast, warnings: Warnings) -> Band:
@@ -171,46 +300,76 @@ def _signed(psi: np.ndarray, settings: Settings, warnings: Warnings) -> np.ndarr
     return -psi if settings.inside == "positive" else psi
 
 
-def _finite_or_missing(data: np.ndarray, warnings: Warnings) -> np.ndarray:
-    """Data whose infinite values are missing too; raises DataError where nothing is left."""
+def _trust(
+    weights: np.ndarray | None, mask: np.ndarray | None, grid: Grid, settings: Settings, warnings: Warnings
+) -> np.ndarray:
+    """Weights over the grid, 0 to 1, 0 where the mask says that data do not count.
+
+    Raises RefusedError for weights below 0, DataError for weights that are 0 everywhere or a mask that is empty.
+    """
+    trust = np.ones(grid.shape, settings.precision)
+    if weights is not None:
+        trust = np.where(np.isfinite(weights), weights, 0).astype(settings.precision)
+        low, high = float(trust.min()), float(trust.max())
+        if low < -NEGATIVE_SHARE * max(high, 0.0):
+            raise RefusedError(f"weights: found values down to {low:g}; expected 0 or more (R^2, coherence, 1/variance)")
+        if high <= 0:
+            raise DataError("weights: found 0 everywhere; expected some data that count")
+        if low < 0:
+            warnings.add(f"weights: values down to {low:g} taken as 0")
+        trust = np.maximum(trust, 0) / high
+    if mask is not None:
+        counts = np.isfinite(mask) & (mask != 0)
+        if not counts.any():
+            raise DataError("mask: found 0 everywhere; expected other values where the data count")
+        trust = np.where(counts, trust, 0)
+    return trust
+
+
+def _finite_or_missing(data: np.ndarray, missing: float | None, warnings: Warnings) -> np.ndarray:
+    """Data whose infinite values, and those equal to `missing`, are NaN; raises DataError where nothing is left."""
+    data = without(data, missing)
     infinite = np.isinf(data)
     if not np.isfinite(data).any():
         found = "NaN and values that are infinite at this precision" if infinite.any() else "NaN"
+        found += "" if missing is None else f" and the missing value {missing:g}"
         raise DataError(f"DATA has no valid value: found only {found}; expected finite values on the surface")
     if infinite.any():
         warnings.add(f"DATA has {int(infinite.sum())} infinite values: taken as missing")
-        data = np.where(infinite, np.nan, data)
+        data = np.where(infinite, data.dtype.type(np.nan), data)
     return data
 
 
-def _within_range(values: np.ndarray, start: Extended) -> tuple[np.ndarray, float]:
-    """Values (E,), NaN where missing, kept within the data's range, and by how much they had left it (data units).
+def without(data: np.ndarray, missing: float | None) -> np.ndarray:
+    """Data with NaN where they equal the value that means missing."""
+    if missing is None:
+        return data
+    return np.where(data == data.dtype.type(missing), data.dtype.type(np.nan), data)
+
+
+def _within_range(values: np.ndarray, start: Extended, kind: Kind) -> tuple[np.ndarray, float]:
+    """Values (K, E), NaN where missing, kept within each channel's range in the data, and by how much they had left it.
 
     No flow leaves the range; differences do, a little, beside the band's ragged rim. Raises NumericsError where it was
-    more than the range's own width: no error of differences, but a runaway.
+    more than the range's own width: no error of differences, but a runaway. Angles have no range to leave.
     """
-    data = start.values[start.known].astype(float)
-    low, high = data.min(), data.max()
-    excess = max(low - float(np.nanmin(values)), float(np.nanmax(values)) - high, 0.0)
-    rounding = 1e-3 * max(abs(low), abs(high))  # of thousands of steps on nearly constant data
-    if not excess <= high - low + rounding:
-        raise NumericsError(
-            f"the flow ran away: found values {excess:.6g} beyond the data's own {low:.6g} to {high:.6g}; "
-            "try a smaller --dt or --scheme symmetric"
-        )
-    return np.clip(values, low, high).astype(values.dtype), excess
-
-
-def _schedule(settings: Settings, dt: float, slope: float) -> Schedule:
-    iterations, dt, ends_by = settings.duration(dt)
-    if settings.flow == "l2":
-        return Schedule(np.zeros(iterations), dt, ends_by)
-    if settings.flow in ("l1", "tv"):
-        eps = settings.eps if settings.eps is not None else EPS_SHARE * slope
-        return Schedule(np.full(iterations, 1 / eps if eps else 0.0), dt, ends_by)
-    if settings.beta.is_auto:
-        return Schedule(np.full(iterations, 1 / slope if slope else 0.0), dt, ends_by)
-    return Schedule(settings.beta.over(iterations), dt, ends_by)
+    if kind.is_circular:
+        if np.nanmax(np.abs(values)) > 2:  # cos and sin; a mean of them is no longer than 1
+            raise NumericsError("the flow of the angle ran away; try a smaller --dt or --scheme symmetric")
+        return values, 0.0
+    most = 0.0
+    for channel, first in zip(values, start.values[:, start.known].astype(float), strict=True):
+        low, high = first.min(), first.max()
+        excess = max(low - float(np.nanmin(channel)), float(np.nanmax(channel)) - high, 0.0)
+        rounding = 1e-3 * max(abs(low), abs(high))  # of thousands of steps on nearly constant data
+        if not excess <= high - low + rounding:
+            raise NumericsError(
+                f"the flow ran away: found values {excess:.6g} beyond the data's own {low:.6g} to {high:.6g}; "
+                "try a smaller --dt or --scheme symmetric"
+            )
+        np.clip(channel, low, high, out=channel)
+        most = max(most, excess)
+    return values, most
 
 
 class PlaneLast:
@@ -241,13 +400,6 @@ class Warnings:
         self.lines.append(line)
         if self._notify:
             self._notify(line)
-
-
-def _as_float(array: np.ndarray, settings: Settings) -> np.ndarray:
-    if array.dtype.kind not in "fiub":
-        raise RefusedError(f"found values of type {array.dtype}; expected real numbers")
-    with np.errstate(over="ignore"):  # what is too large becomes infinite, and is reported as that
-        return array.astype(settings.precision)
 
 
 def require_usable(grid: Grid, name: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from common import SHAPE, folded_surface
 
 from beltrami_cli.band import build_band
-from beltrami_cli.flows import Flow
+from beltrami_cli.flows import Flow, Stepper
 from beltrami_cli.grid import Grid
 
 HALF_WIDTH = 3.0  # voxels
@@ -30,8 +30,8 @@ def main() -> None:
     band = build_band(psi, Grid.from_spacing(SHAPE), HALF_WIDTH)
     voxels = len(band.primary)
     a, b, c = np.ones((3, 20 * voxels // 12), np.float32)
-    u, out = band.gather(data), np.empty(band.entries, np.float32)
-    steppers = {scheme: Flow(scheme=scheme).stepper(band, u.dtype) for scheme in BOUNDS}
+    u, out = band.gather(data)[None], np.empty((1, band.entries), np.float32)
+    steppers = {scheme: Stepper(Flow(scheme=scheme), band, u.dtype) for scheme in BOUNDS}
     runs: dict[str, Callable[[], object]] = {"triad": lambda: triad(a, b, np.float32(0.5), c)}
     for scheme, step in steppers.items():
         runs[scheme] = lambda step=step: step(u, out, 0.02, 0.15)

@@ -39,50 +39,85 @@ def projection(normal):
     return np.eye(3)[:, :, None] - normal[:, None] * normal[None]
 
 
-def symmetric(u, normal, forward, backward, spacing, law, outer, beta, dt):
-    """One step as minus the exact gradient of the mean energy c |P g|^2 / 2 over the 8 choices of g, c held fixed.
+def tangential(normal, d, u):
+    """(K, 3, E): v = P g of every channel, the differences g = d u by the matrices d (3, E, E)."""
+    return np.einsum("abm,bmi,ki->kam", projection(normal), d, u, optimize=True)
 
-    c is taken at the central differences. Returns (u after the step, sum of squared changes, energy).
+
+# A coupling is a function of v (K, 3, E) and beta that gives C (K, K, E) and the outer factor a (E,).
+
+
+def shared(law):
+    """One diffusivity for all channels: C = c I at s = beta sqrt(sum_k |v_k|^2), a = c."""
+
+    def coupling(v, beta):
+        c = DIFFUSIVITY[law](beta * np.sqrt((v**2).sum((0, 1))))
+        return np.eye(len(v))[:, :, None] * c, c
+
+    return coupling
+
+
+def by_metric(v, beta):
+    """C = sqrt(det M) M^-1 and a = 1 / sqrt(det M), with M = I + beta^2 V^T V, V the matrix [v_1 ... v_K]."""
+    m = np.eye(len(v)) + beta**2 * np.einsum("kam,lam->mkl", v, v)
+    size = np.sqrt(np.linalg.det(m))
+    return np.moveaxis(size[:, None, None] * np.linalg.inv(m), 0, -1), 1 / size
+
+
+def symmetric(u, normal, forward, backward, spacing, coupling, outer, beta, dt):
+    """One step of u (K, E): minus the exact gradient of the mean of sum_kl C_kl v_k^T v_l / 2 over the 8 choices of g.
+
+    C is taken at the central differences, and held fixed. Returns (u after the step, sum of squared changes, energy).
     """
     d = difference_matrices(forward, backward, spacing)
-    p = projection(normal)
-    central = np.einsum("abm,bmk,k->am", p, d.mean(0), u)
-    c = DIFFUSIVITY[law](beta * np.sqrt((central**2).sum(0)))
-    rate, energy = np.zeros(len(u)), 0.0
+    c, a = coupling(tangential(normal, d.mean(0), u), beta)
+    rate, energy = np.zeros(u.shape), 0.0
     for sides in product((0, 1), repeat=3):
         g = np.stack([d[side, a] for a, side in enumerate(sides)])
-        v = np.einsum("abm,bmk,k->am", p, g, u)
-        rate -= np.einsum("amk,am->k", g, c * v) / 8
-        energy += (c * v**2).sum() / 16
-    change = dt * (c if outer else 1) * rate
+        v = tangential(normal, g, u)
+        flux = np.einsum("klm,lam->kam", c, v)
+        rate -= np.einsum("ami,kam->ki", g, flux) / 8
+        energy += (flux * v).sum() / 16
+    change = dt * (a if outer else 1) * rate
     return u + change, (change**2).sum(), energy
 
 
-def symmetric_by_fluxes(u, normal, forward, backward, spacing, law, outer, beta, dt):
+def symmetric_by_fluxes(u, normal, forward, backward, spacing, coupling, outer, beta, dt):
     """The same step written as a finite-volume scheme: fluxes through the faces between linked entries."""
-    own = np.arange(len(u))
+    own = np.arange(u.shape[1])
     p = projection(normal)
     h = np.asarray(spacing)[:, None]
-    g = (u[forward] - u[backward]) / (2 * h)  # a missing link adds 0 to either side
-    v = np.einsum("abm,bm->am", p, g)
-    c = DIFFUSIVITY[law](beta * np.sqrt((v**2).sum(0)))
-    rate = np.zeros(len(u))
+    g = (u[:, forward] - u[:, backward]) / (2 * h)  # a missing link adds 0 to either side
+    v = np.einsum("abm,kbm->kam", p, g)
+    c, outer_factor = coupling(v, beta)
+    rate = np.zeros(u.shape)
     for a in range(3):
-        q = c * (v[a] - p[a, a] * g[a])
+        q = np.einsum("klm,lm->km", c, v[:, a] - p[a, a] * g[:, a])
         f = forward[a]
-        flux = (c * p[a, a] + (c * p[a, a])[f]) / 2 * (u[f] - u) / h[a] + (q + q[f]) / 2
-        flux[f == own] = 0
-        rate += flux / h[a] - np.where(backward[a] == own, 0, flux[backward[a]]) / h[a]
-    return u + dt * (c if outer else 1) * rate
+        along = c * p[a, a]
+        flux = np.einsum("klm,lm->km", along + along[:, :, f], u[:, f] - u) / 2 / h[a] + (q + q[:, f]) / 2
+        flux[:, f == own] = 0
+        rate += flux / h[a] - np.where(backward[a] == own, 0, flux[:, backward[a]]) / h[a]
+    return u + dt * (outer_factor if outer else 1) * rate
 
 
-def paper(u, normal, forward, backward, spacing, law, outer, beta, dt):
+def paper(u, normal, forward, backward, spacing, coupling, outer, beta, dt):
     """Sec. 4.1 with |N| = 1: forward gradient and its adjoint, the backward divergence. Returns as `symmetric`."""
     d = difference_matrices(forward, backward, spacing)[0]
-    v = np.einsum("abm,bmk,k->am", projection(normal), d, u)
-    c = DIFFUSIVITY[law](beta * np.sqrt((v**2).sum(0)))
-    change = -dt * (c if outer else 1) * np.einsum("amk,am->k", d, c * v)
-    return u + change, (change**2).sum(), (c * v**2).sum() / 2
+    v = tangential(normal, d, u)
+    c, a = coupling(v, beta)
+    flux = np.einsum("klm,lam->kam", c, v)
+    change = -dt * (a if outer else 1) * np.einsum("ami,kam->ki", d, flux)
+    return u + change, (change**2).sum(), (flux * v).sum() / 2
+
+
+def largest_over_faces(tensor, outer, forward):
+    """The most, over the faces i|j and both their sides, of a_i lambda_max(C_i + C_j) / 2."""
+    c, own = np.moveaxis(tensor, -1, 0), np.arange(len(outer))
+    return max(
+        float((np.maximum(outer, outer[f]) * np.linalg.eigvalsh(c + c[f])[:, -1] / 2)[f != own].max(initial=0))
+        for f in forward
+    )
 
 
 # --- interpolation on a sheet ---------------------------------------------------------------------------------------
@@ -115,27 +150,44 @@ def cubic_at(volume, ijk):
 
     NaN where one of the 64 nodes is outside or NaN. An axis of length 1 takes no part.
     """
+    value, cell = cubic_and_cell(volume, ijk)
+    return np.clip(value, cell.min(), cell.max())
+
+
+def cubic_vector_at(volumes, ijk):
+    """(K,) local cubics of the volumes (K, nx, ny, nz): as a vector no longer than the longest of the eight nodes."""
+    values, cells = zip(*(cubic_and_cell(volume, ijk) for volume in volumes), strict=True)
+    most = np.sqrt((np.stack(cells) ** 2).sum(0)).max()
+    return np.array(values) * min(1, most / max(np.linalg.norm(values), 1e-300))
+
+
+def cubic_and_cell(volume, ijk):
+    """The cubic itself, and the values of the nodes around."""
     low = np.floor(ijk).astype(int)
     nodes = [np.arange(x - 1, x + 3) if n > 1 else np.array([0]) for x, n in zip(low, volume.shape, strict=True)]
     if any(x[0] < 0 or x[-1] >= n for x, n in zip(nodes, volume.shape, strict=True)):
-        return np.nan
+        return np.nan, np.array([np.nan])
     weights = [lagrange(t) if n > 1 else np.ones(1) for t, n in zip(ijk - low, volume.shape, strict=True)]
     block = volume[np.ix_(*nodes)]
     cell = block[tuple(slice(1, 3) if n > 1 else slice(None) for n in volume.shape)]
-    return np.clip(np.einsum("ijk,i,j,k", block, *weights), cell.min(), cell.max())
+    return np.einsum("ijk,i,j,k", block, *weights), cell
 
 
-def linear_at(u, e, offset, forward, backward, least):
-    """Trilinear mean of the corners of the cell at `offset` (3,) from entry e that are reached and known; else None."""
+def linear_at(u, confidence, e, offset, forward, backward, least):
+    """Sums of confidence times u (K, E), and of confidence, over the corners of the cell at `offset` (3,) from entry e.
+
+    Trilinear weights of the corners that are reached and have confidence; zeros where these weights are too few.
+    """
     low = np.floor(offset).astype(int)
-    total = weight = 0.0
+    total, mass, weight = np.zeros(len(u)), 0.0, 0.0
     for corner in product((0, 1), repeat=3):
         w = np.prod([t if k else 1 - t for t, k in zip(offset - low, corner, strict=True)])
         reached = walk(e, low + corner, forward, backward)
-        if w > 0 and reached is not None and not np.isnan(u[reached]):
-            total += w * u[reached]
+        if w > 0 and reached is not None and confidence[reached] > 0:
+            total += w * confidence[reached] * u[:, reached]
+            mass += w * confidence[reached]
             weight += w
-    return total / weight if weight > least else None
+    return (total, mass) if weight > least else (np.zeros(len(u)), 0.0)
 
 
 # --- extension ------------------------------------------------------------------------------------------------------
@@ -156,7 +208,7 @@ def transport(u, normal, distance, forward, backward, spacing, width, dt):
 
 
 def flood(u, forward, backward):
-    """Ring by ring: every unknown entry with a known neighbour takes the mean of its known neighbours."""
+    """Ring by ring: every unknown entry of u (E,) with a known neighbour takes the mean of its known neighbours."""
     u = u.copy()
     while True:
         around = np.concatenate([u[forward], u[backward]])
@@ -165,6 +217,15 @@ def flood(u, forward, backward):
         if not new.any():
             return u
         u[new] = np.nansum(around, 0)[new] / count[new]
+
+
+def harmonic(u, free, forward, backward, spacing):
+    """u (K, E) with the entries `free` (F,) such that the 7-point Laplacian over links vanishes there."""
+    ahead, behind = difference_matrices(forward, backward, spacing)
+    laplacian = sum((a - b) / h for a, b, h in zip(ahead, behind, spacing, strict=True))[free]
+    out, fixed = u.copy(), np.setdiff1d(np.arange(u.shape[1]), free)
+    out[:, free] = np.linalg.solve(laplacian[:, free], -laplacian[:, fixed] @ u[:, fixed].T).T
+    return out
 
 
 # --- geometry -------------------------------------------------------------------------------------------------------

@@ -182,6 +182,10 @@ def test_gather_and_scatter():
     inside = back >= 0
     assert np.array_equal(back[inside], volume[inside]) and inside.sum() == len(band.primary) < band.entries
     assert np.array_equal(band.scatter(entries, volume + 0.5)[~inside], volume[~inside] + 0.5)
+    pair = np.stack([volume, -volume], -1)
+    assert np.array_equal(band.gather(pair), np.stack([entries, -entries], 1))
+    assert np.array_equal(band.scatter(band.gather(pair), pair + 0.5)[inside], pair[inside])
+    assert np.array_equal(band.scatter(band.gather(pair), pair + 0.5)[~inside], pair[~inside] + 0.5)
 
 
 @pytest.mark.parametrize("garbage", [np.nan, np.inf])

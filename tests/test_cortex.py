@@ -12,7 +12,7 @@ from beltrami_cli import denoise
 from beltrami_cli.band import Band, build_band
 from beltrami_cli.evolve import Schedule, evolve
 from beltrami_cli.extension import Reextension
-from beltrami_cli.flows import Flow
+from beltrami_cli.flows import Flow, Stepper
 from beltrami_cli.formats import read_volume
 from beltrami_cli.grid import Grid
 from beltrami_cli.kernels import interpolate
@@ -50,7 +50,7 @@ def away_from_border(vertices, triangles, ijk, shape):
 
 
 def at_points(band: Band, u: np.ndarray, ijk: np.ndarray) -> np.ndarray:
-    """(N,) u (E,) at points of the surface in voxels of the whole grid: local cubic on the sheet of the nearest vertex.
+    """(N,) u (1, E) at points of the surface in voxels of the whole grid: local cubic on the sheet of the nearest vertex.
 
     Starts from that vertex's own nearest entry; trilinear where the cubic's stencil is incomplete.
     """
@@ -66,11 +66,13 @@ def at_points(band: Band, u: np.ndarray, ijk: np.ndarray) -> np.ndarray:
         start[k] = entries[(apart**2).sum(1).argmin()]
     at = np.stack(np.unravel_index(band.voxel[start], band.box_shape), 1)
     offset = np.ascontiguousarray((q - at).T.astype(np.float32))
-    out = np.full(len(q), np.nan, u.dtype)
-    interpolate.linear(u, start, offset, band.forward, band.backward, 0.1, out)
+    total, mass = np.zeros((1, len(q))), np.zeros(len(q))
+    there = np.ones(band.entries, u.dtype)
+    interpolate.linear(u, there, start, offset, band.forward, band.backward, 0.1, total, mass)
+    out = (total / mass).astype(u.dtype)
     origin = interpolate.stencil_origins(start, offset, band.forward, band.backward, band.nodes)
-    interpolate.cubic(u, origin, offset, band.forward, band.nodes, out)
-    return out
+    interpolate.cubic(u, np.empty(0, u.dtype), origin, offset, band.forward, band.nodes, out)
+    return out[0]
 
 
 def test_heat_flow_is_that_of_finite_elements(shared_data: Path):
@@ -93,9 +95,9 @@ def test_heat_flow_is_that_of_finite_elements(shared_data: Path):
     foot = np.stack(np.unravel_index(band.voxel, band.box_shape), 1) + low + band.closest_offset.T
     apart, nearest = cKDTree(ijk).query(foot, k=3)
     weight = 1 / (apart + 0.05)
-    u = ((start[nearest] * weight).sum(1) / weight.sum(1)).astype(np.float32)
+    u = ((start[nearest] * weight).sum(1) / weight.sum(1)).astype(np.float32)[None]
 
-    flow, dt, done = Flow("l2").stepper(band, u.dtype), 0.15 * h**2, 0
+    flow, dt, done = Stepper(Flow("l2"), band, u.dtype), 0.15 * h**2, 0
     for t, least in ((3.0, 0.998), (8.0, 0.997)):
         steps = round(t / dt)
         u = evolve(u, flow, Schedule(np.zeros(steps - done), dt), Reextension(band), 5).values

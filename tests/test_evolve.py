@@ -29,10 +29,10 @@ def recorder(log):
 def test_runs_the_schedule_and_says_why_it_stopped():
     log = []
     step, _ = recorder(log)
-    start = np.zeros(3)
+    start = np.zeros((1, 3))
     evolution = evolve(start, step, Schedule(np.array([0.1, 0.2, 0.4]), 0.15, "fwhm"))
     assert log == [(0.1, 0.15), (0.2, 0.15), (0.4, 0.15)]
-    assert np.array_equal(evolution.values, [3, 3, 3]) and np.array_equal(start, [0, 0, 0])
+    assert np.array_equal(evolution.values, [[3, 3, 3]]) and np.array_equal(start, [[0, 0, 0]])
     assert evolution.stop_reason == "fwhm"
     assert evolution.change.tolist() == [1, 1, 1]
     assert evolution.energy.tolist() == [0, 3, 6]
@@ -41,9 +41,9 @@ def test_runs_the_schedule_and_says_why_it_stopped():
 @pytest.mark.parametrize(("every", "extensions"), [(0, 0), (1, 7), (3, 2), (7, 1), (8, 0)])
 def test_extends_after_every_so_many_steps(every, extensions):
     log = []
-    evolution = evolve(np.zeros(2), *reordered(recorder(log), 7), every)
+    evolution = evolve(np.zeros((1, 2)), *reordered(recorder(log), 7), every)
     assert log.count("extend") == extensions
-    assert evolution.values[0] == 7 + 100 * extensions
+    assert evolution.values[0, 0] == 7 + 100 * extensions
     if extensions:
         assert log.index("extend") == every
 
@@ -55,16 +55,54 @@ def reordered(functions, iterations):
 
 def test_no_iterations_leave_the_start():
     step, _ = recorder([])
-    evolution = evolve(np.arange(4.0), step, Schedule(np.zeros(0), 0.15))
-    assert np.array_equal(evolution.values, np.arange(4)) and evolution.stop_reason == "iterations"
+    evolution = evolve(np.arange(4.0)[None], step, Schedule(np.zeros(0), 0.15))
+    assert np.array_equal(evolution.values, [np.arange(4)]) and evolution.stop_reason == "iterations"
     assert len(evolution.change) == len(evolution.energy) == 0
 
 
 def test_observer_sees_every_iteration():
     step, _ = recorder([])
     seen = []
-    evolve(np.zeros(1), step, Schedule(np.zeros(3), 0.1), observer=lambda *what: seen.append(what))
+    evolve(np.zeros((1, 1)), step, Schedule(np.zeros(3), 0.1), observer=lambda *what: seen.append(what))
     assert seen == [(1, 3, 1.0), (2, 3, 1.0), (3, 3, 1.0)]
+
+
+def test_a_stop_ends_the_run_and_names_why():
+    """Asked before the first step and after each, with the values as re-extended."""
+    log, asked = [], []
+
+    def stop(done, u):
+        asked.append((done, float(u[0, 0])))
+        return "cold" if done == 3 else None
+
+    evolution = evolve(np.zeros((1, 2)), *reordered(recorder(log), 7), 2, stop=stop)
+    assert asked == [(0, 0.0), (1, 1.0), (2, 102.0), (3, 103.0)]
+    assert evolution.stop_reason == "cold" and evolution.iterations == len(evolution.energy) == 3
+    assert np.all(evolution.values == 103) and len(log) == 4
+
+
+def test_a_stop_before_the_first_step_leaves_the_start():
+    log = []
+    step, _ = recorder(log)
+    evolution = evolve(np.ones((2, 3)), step, Schedule(np.zeros(5), 0.1), stop=lambda done, u: "enough")
+    assert evolution.stop_reason == "enough" and evolution.iterations == 0 and log == []
+    assert np.array_equal(evolution.values, np.ones((2, 3)))
+
+
+def test_a_stop_that_never_comes_leaves_the_schedule_its_reason():
+    step, _ = recorder([])
+    evolution = evolve(np.zeros((1, 1)), step, Schedule(np.zeros(4), 0.1, "time"), stop=lambda done, u: None)
+    assert evolution.stop_reason == "time" and evolution.iterations == 4
+
+
+def test_a_stop_comes_after_the_observer():
+    seen = []
+    step, _ = recorder([])
+    evolve(
+        np.zeros((1, 1)), step, Schedule(np.zeros(2), 0.1),
+        observer=lambda k, n, moved: seen.append(("observer", k)), stop=lambda done, u: seen.append(("stop", done)),
+    )  # fmt: skip
+    assert seen == [("stop", 0), ("observer", 1), ("stop", 1), ("observer", 2), ("stop", 2)]
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -74,7 +112,7 @@ def test_values_that_blow_up_are_an_error_at_that_iteration(bad):
         return (bad if beta == 3 else 0.0), 0.0
 
     with pytest.raises(NumericsError, match="iteration 4"):
-        evolve(np.zeros(1), step, Schedule(np.arange(6.0), 0.1))
+        evolve(np.zeros((1, 1)), step, Schedule(np.arange(6.0), 0.1))
 
 
 @pytest.mark.parametrize("options", [{"flow": "l2"}, {"beta": 1.0}])
@@ -139,4 +177,4 @@ def test_every_record_is_of_the_run():
     record = denoise(phantom.levelset, phantom.noisy, flow="l2", iterations=9).record["PerIteration"]
     assert np.all(np.diff(record["energy"][:5]) < 0)
     assert np.all(np.diff(record["change_rms"][:5]) < 0)
-    assert all(len(column) == 9 for column in record.values())
+    assert all(len(record[name]) == 9 for name in ("beta", "dt", "dt_over_beta", "change_rms", "energy"))

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_band import band_of
+from test_band import band_of, positions
 from test_levelset import ball
 
 from beltrami_cli import denoise, phantoms
 from beltrami_cli.band import flat_band
-from beltrami_cli.flows import FLOWS, PHI_LAWS, SCHEMES, Flow, stability_bound, typical_slope
+from beltrami_cli.flows import FLOWS, PHI_LAWS, SCHEMES, Fidelity, Flow, Stepper, stability_bound, typical_slope
 from beltrami_cli.grid import Grid
 
 
-def steps(flow, band, u, beta, dt, count=1):
-    """u (E,) after `count` steps without re-extension, and (count,) energies before each."""
-    step, energy = flow.stepper(band, u.dtype), []
-    u, out = u.copy(), np.empty_like(u)
+def steps(flow, band, u, beta, dt, count=1, **options):
+    """u, (E,) or (K, E), after `count` steps without re-extension, and (count,) energies before each."""
+    v, energy = np.atleast_2d(u).copy(), []
+    step = Stepper(flow, band, u.dtype, len(v), **options)
+    out = np.empty_like(v)
     for _ in range(count):
-        energy.append(step(u, out, beta, dt)[1])
-        u, out = out, u
-    return u, np.array(energy)
+        energy.append(step(v, out, beta, dt)[1])
+        v, out = out, v
+    return v.reshape(u.shape), np.array(energy)
 
 
 def random_band(spacing=(1.0, 1.0, 1.0), name="sphere", dtype=np.float64):
@@ -196,21 +197,117 @@ def test_every_flow_stays_in_range_at_the_bound(name, scheme):
                 assert np.ptp(after) <= 1.01 * np.ptp(u)
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("name", FLOWS)
+def test_channels_of_one_diffusivity_stay_in_range_at_the_bound(name, scheme):
+    """Each in its own: a neighbour's edge lowers c and no more."""
+    band, _, bound = random_band(name="sulcus")
+    u = np.random.default_rng(2).normal(size=(3, band.entries)) * [[1], [100], [0.01]]
+    for beta in (0.05, 100.0):
+        after, _ = steps(Flow(name, "weickert", scheme), band, u, beta, bound, 40)
+        assert np.all(np.ptp(after, axis=1) <= 1.01 * np.ptp(u, axis=1))
+
+
+@pytest.mark.parametrize("flow", [Flow(), Flow("tv"), Flow("phi")])
+def test_beta_counts_in_data_units(flow):
+    """u in units of 7 data units at beta is 7 u at beta; a copy of the channel adds to the slope by Pythagoras."""
+    band, u, bound = random_band()
+    plain, energy = steps(flow, band, 7 * u, 0.3, bound, 5)
+    in_units, energy_in_units = steps(flow, band, u, 0.3, bound, 5, unit=7.0)
+    assert np.allclose(plain, 7 * in_units, atol=1e-12)
+    assert np.allclose(energy, 49 * energy_in_units, rtol=1e-12)
+    twice, _ = steps(flow, band, np.stack([u, u]) * 7 / np.sqrt(2), 0.3, bound, 5)
+    assert np.allclose(twice * np.sqrt(2), plain, atol=1e-12)
+
+
 def test_step_reports_change_and_energy():
     grid = Grid.from_spacing((30, 20, 1), (0.5, 2.0))
     band = flat_band(grid)
-    u = 3.0 * np.arange(30.0).repeat(20) * 0.5  # 3 per mm along the first axis
+    u = 3.0 * np.arange(30.0).repeat(20)[None] * 0.5  # 3 per mm along the first axis
     out = np.empty_like(u)
-    change, energy = Flow("l2").stepper(band, u.dtype)(u, out, 0.0, 0.1)
+    change, energy = Stepper(Flow("l2"), band, u.dtype)(u, out, 0.0, 0.1)
     assert energy == pytest.approx(29 / 30 * 4.5)  # 29 links of 30 voxels
     assert change == pytest.approx(np.sqrt(np.mean((out - u) ** 2)))
     assert change == pytest.approx(0.1 * 3 / 0.5 * np.sqrt(2 / 30))  # only the end rows gain or lose a flux
 
 
+def test_channels_add_up_in_change_and_energy():
+    band, u, bound = random_band()
+    out, both, two = np.empty((1, band.entries)), np.stack([u, 2 * u]), np.empty((2, band.entries))
+    change, energy = Stepper(Flow("l2"), band, u.dtype)(u[None], out, 0.0, bound)
+    assert Stepper(Flow("l2"), band, u.dtype, 2)(both, two, 0.0, bound) == pytest.approx(
+        (np.sqrt(5) * change, 5 * energy), rel=1e-12
+    )
+    assert change == pytest.approx(np.sqrt(np.mean((out[0] - u) ** 2)))
+
+
 def test_typical_slope():
     band, u, _, _, core = oblique_plane_wave(24)
-    assert 2 < typical_slope(band, u, core) < np.sqrt(5)
-    assert typical_slope(band, np.full(band.entries, 3.0), core) == 0
+    assert 2 < typical_slope(band, u[None], core) < np.sqrt(5)
+    both, alone = typical_slope(band, np.stack([u, 2 * u]), core), typical_slope(band, u[None], core)
+    assert both == pytest.approx(np.sqrt(5) * alone)
+    assert typical_slope(band, np.full((1, band.entries), 3.0), core) == 0
+
+
+# --- fidelity ---------------------------------------------------------------------------------------------------------
+
+
+def pulled(band, u, rate, name="l2", beta=0.0, count=1, dtype=np.float64):
+    """u (K, E) after `count` steps at the default dt that pull it back to where it began, at `rate` (E,) per mm^2."""
+    dt = 0.9 * stability_bound(band.grid.spacing, band.grid.shape)
+    u = u.astype(dtype)
+    return steps(Flow(name), band, u, beta, dt, count, fidelity=Fidelity(u.copy(), rate.astype(dtype)))[0]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", FLOWS)
+def test_any_fidelity_is_stable(name, dtype):
+    band, u, _ = random_band(name="sulcus")
+    u = np.stack([u, 10 * u[::-1]])
+    weight = np.random.default_rng(3).uniform(0, 1, band.entries).round(1)
+    assert (weight == 0).mean() > 0.03
+    for rate in (1e-3, 1.0, 1e6, 1e12):
+        after = pulled(band, u, rate * weight, name, 0.3, 20, dtype)
+        assert np.all(np.ptp(after, axis=1) <= 1.01 * np.ptp(u, axis=1))
+        if rate >= 1e6:
+            held = weight >= 0.1
+            # what a step adds, at most the range of 80, over 1 + dt L w
+            assert np.abs(after - u)[:, held].max() < 0.01 < np.abs(after - u)[:, ~held].max()
+
+
+def test_without_weight_there_is_no_fidelity():
+    """0 everywhere is the flow alone; 0 on a part paints it in from the rest, whatever was there before."""
+    band, u, bound = random_band()
+    alone, _ = steps(Flow("l2"), band, u, 0.0, 0.9 * bound, 10)
+    assert np.array_equal(pulled(band, u[None], np.zeros(band.entries), count=10)[0], alone)
+    ramp = positions(band)[:, 0]
+    hole = np.abs(ramp - np.median(ramp)) < 2
+    results = [
+        pulled(band, np.where(hole, start, ramp)[None], np.where(hole, 0.0, 1e9), count=600)[0][hole]
+        for start in (0.0, ramp.max())
+    ]
+    assert np.abs(results[0] - results[1]).max() < 1e-3
+    assert np.corrcoef(results[0], ramp[hole])[0, 1] > 0.95
+
+
+def test_fixed_point_of_heat_and_fidelity():
+    """Div(v) + L w (U0 - U) = 0 at every entry, where Div(v) is what a step of the flow alone adds per mm^2."""
+    band, u, bound = random_band()
+    rate = 0.8 * np.random.default_rng(4).uniform(0.3, 1, band.entries)
+    rest = pulled(band, u[None], rate, count=400)[0]
+    stepped, _ = steps(Flow("l2"), band, rest, 0.0, bound)
+    flow, pull = (stepped - rest) / bound, rate * (u - rest)
+    assert np.abs(flow + pull).max() < 1e-9 and np.abs(pull).max() > 0.5
+
+
+def test_change_counts_fidelity():
+    band, u, bound = random_band()
+    out, target = np.empty((1, band.entries)), np.zeros((1, band.entries))
+    pull = Fidelity(target, np.full(band.entries, 5.0))
+    change, _ = Stepper(Flow("l2"), band, u.dtype, fidelity=pull)(u[None], out, 0.0, bound)
+    assert change == pytest.approx(np.sqrt(np.mean((out[0] - u) ** 2)), rel=1e-12)
+    alone, _ = steps(Flow("l2"), band, u, 0.0, bound)
+    assert np.allclose(out[0], alone / (1 + 5 * bound), atol=1e-14)
 
 
 # --- no leak between the banks of a sulcus --------------------------------------------------------------------------

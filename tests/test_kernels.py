@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import reference
 
-from beltrami_cli.kernels import extend, interpolate, mesh, sheets, steps
+from beltrami_cli.kernels import extend, interpolate, mesh, metric, sheets, steps
 
 LAWS = list(reference.DIFFUSIVITY)
 SPACINGS = [(1.0, 1.0, 1.0), (0.7, 1.1, 2.3)]
@@ -36,48 +36,114 @@ def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=0)
 
 
-def take_step(kernel, u, normal, forward, backward, spacing, law, outer, beta, dt):
-    out, work = np.empty_like(u), np.empty((7, len(u)), u.dtype)
-    squares, energy = kernel(
-        u, normal.astype(u.dtype), forward, backward, np.array(spacing, u.dtype), law, outer, beta, dt, work, out
-    )
-    return out, squares, energy
+def take_step(name, u, normal, forward, backward, spacing, law, outer, beta, dt):
+    """One step of u (K, E) by the kernels: channels share the diffusivity of a law, or where it is None their metric.
+
+    Returns (u after it, sum of squared changes, energy), as the twins do.
+    """
+    (channels, entries), dtype = u.shape, u.dtype
+    place = u, normal.astype(dtype), forward, backward, np.array(spacing, dtype)
+    flux, work = np.empty((2, channels, 3, entries), dtype)
+    a, out = np.empty(entries, dtype), np.empty_like(u)
+    if law is None:
+        tensor, largest = np.empty((channels, channels, entries), dtype), np.empty(entries, dtype)
+        energy, _ = getattr(metric, name)(*place, beta, flux, work, tensor, a, largest)
+    else:
+        energy = getattr(steps, name)(*place, law, beta, flux, work, a)
+    return out, steps.diverge(u, flux, backward, a, outer, dt, out), energy
+
+
+def random_values(rng, channels, entry):
+    """u (K, E) of order 1, and unit normals (3, E)."""
+    return rng.normal(size=(channels, entry.max() + 1)), unit(rng.normal(size=(3, entry.max() + 1)))
+
+
+def coupling_of(law):
+    return reference.by_metric if law is None else reference.shared(law)
 
 
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
+@pytest.mark.parametrize("channels", [1, 2, 3, 5])
 @pytest.mark.parametrize("spacing", SPACINGS)
-@pytest.mark.parametrize("outer", [True, False])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", [*LAWS, None])
 @pytest.mark.parametrize("name", ["symmetric", "paper"])
-def test_step(name, law, outer, spacing, precision):
-    rng = np.random.default_rng(law)
+def test_step(name, law, spacing, channels, precision):
+    rng = np.random.default_rng(channels)
     forward, backward, entry = random_links(rng)
-    u, normal = rng.normal(size=entry.max() + 1), unit(rng.normal(size=(3, entry.max() + 1)))
-    arguments = (normal, forward, backward, spacing, law, outer, 0.8, 0.1)
-    got = take_step(getattr(steps, name), u.astype(precision), *arguments)
-    for value, expected in zip(got, getattr(reference, name)(u, *arguments), strict=True):
-        assert np.allclose(value, expected, rtol=ROUNDING[precision], atol=ROUNDING[precision])
+    u, normal = random_values(rng, channels, entry)
+    for outer in (True, False):
+        place, rest = (normal, forward, backward, spacing), (outer, 0.8, 0.1)
+        got = take_step(name, u.astype(precision), *place, law, *rest)
+        expected = getattr(reference, name)(u, *place, coupling_of(law), *rest)
+        for value, twin in zip(got, expected, strict=True):
+            assert np.allclose(value, twin, rtol=ROUNDING[precision], atol=ROUNDING[precision])
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", [*LAWS, None])
 def test_mean_over_eight_choices_is_the_flux_form(law):
-    rng = np.random.default_rng(10 + law)
+    rng = np.random.default_rng(10)
     forward, backward, entry = random_links(rng)
-    u, normal = rng.normal(size=entry.max() + 1), unit(rng.normal(size=(3, entry.max() + 1)))
-    arguments = (u, normal, forward, backward, SPACINGS[1], law, True, 0.8, 0.1)
+    u, normal = random_values(rng, 2, entry)
+    arguments = (u, normal, forward, backward, SPACINGS[1], coupling_of(law), True, 0.8, 0.1)
     assert np.allclose(reference.symmetric(*arguments)[0], reference.symmetric_by_fluxes(*arguments), atol=1e-13)
 
 
+@pytest.mark.parametrize("name", ["symmetric", "paper"])
+@pytest.mark.parametrize("scale", [1.0, 1e3, 1e6])
+def test_metric_of_one_channel_is_the_shared_diffusivity(scale, name):
+    rng = np.random.default_rng(11)
+    forward, backward, entry = random_links(rng)
+    u, normal = random_values(rng, 1, entry)
+    arguments = (scale * u, normal, forward, backward, SPACINGS[1])
+    shared, coupled = (take_step(name, *arguments, law, True, 0.8, 0.1) for law in (steps.R, None))
+    assert np.abs(coupled[0] - shared[0]).max() < 1e-14 * scale
+    assert coupled[1:] == pytest.approx(shared[1:], rel=1e-12)
+
+
+@pytest.mark.parametrize("scales", [(1, 1e4), (1e4, 1e4), (1, 1e3, 1e3)])
+def test_metric_at_slopes_far_above_the_edge(scales):
+    """Its smallest numbers come out of the largest ones: as exactly as inverting M itself."""
+    rng = np.random.default_rng(12)
+    forward, backward, entry = random_links(rng)
+    u, normal = random_values(rng, len(scales), entry)
+    arguments = (u * np.array(scales)[:, None], normal, forward, backward, SPACINGS[1])
+    got = take_step("symmetric", *arguments, None, True, 0.8, 0.1)
+    expected = reference.symmetric(*arguments, reference.by_metric, True, 0.8, 0.1)
+    change, exact = (stepped - arguments[0] for stepped in (got[0], expected[0]))
+    assert np.all(np.abs(change - exact).max(1) < 1e-6 * np.abs(exact).max(1))
+    assert got[2] == pytest.approx(expected[2], rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["symmetric", "paper"])
+@pytest.mark.parametrize("channels", [1, 2, 3, 5])
+def test_metric_bounds_the_step(channels, name):
+    """At least the largest a_i lambda_max(C_i + C_j) / 2 over the faces; at most what sqrt(det M) would give for it."""
+    rng = np.random.default_rng(13)
+    forward, backward, entry = random_links(rng)
+    u, normal = random_values(rng, channels, entry)
+    u[0] *= 30
+    flux, work = np.empty((2, channels, 3, u.shape[1]))
+    tensor, (a, largest) = np.empty((channels, channels, u.shape[1])), np.empty((2, u.shape[1]))
+    place = u, normal, forward, backward, np.array(SPACINGS[1])
+    _, bound = getattr(metric, name)(*place, 1.0, flux, work, tensor, a, largest)
+    least = reference.largest_over_faces(tensor, a, forward)
+    f = np.where(forward == np.arange(len(a)), -1, forward)
+    most = max((np.maximum(a, a[x]) * (1 / a + 1 / a[x]) / 2)[x >= 0].max() for x in f)
+    assert least <= bound * (1 + 1e-12) and bound <= most * (1 + 1e-12)
+    assert least > 3 if channels > 1 else bound <= 1
+    eigenvalues = np.linalg.eigvalsh(np.moveaxis(tensor, -1, 0))
+    assert np.all(eigenvalues[:, -1] <= largest * (1 + 1e-9)) and np.all(eigenvalues[:, 0] > 0)
+
+
 def diffusivity(law, slopes):
-    """c at each beta |v|, from the energy c |v|^2 / 2 of two linked entries."""
-    forward, backward = np.array([[1, 1], [0, 1], [0, 1]], np.int32), np.array([[0, 0], [0, 1], [0, 1]], np.int32)
-
-    def energy(s):
-        return take_step(
-            steps.paper, np.array([0, s]), np.zeros((3, 2)), forward, backward, (1.0, 1.0, 1.0), law, False, 1.0, 0.1
-        )[2]
-
-    return np.array([2 * energy(s) / s**2 for s in slopes])
+    """c at each beta |v|: pairs of linked entries, the second of each at the slope."""
+    first, count = 2 * np.arange(len(slopes)), 2 * len(slopes)
+    forward, backward = np.tile(np.arange(count, dtype=np.int32), (2, 3, 1))
+    forward[0, first], backward[0, first + 1] = first + 1, first
+    u, c = np.zeros((1, count)), np.empty(count)
+    u[0, first + 1] = slopes
+    steps.paper(u, np.zeros((3, count)), forward, backward, np.ones(3), law, 1.0, *np.empty((2, 1, 3, count)), c)
+    return c[first]
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -96,13 +162,16 @@ def test_weickert_flux_is_largest_at_the_edge_slope():
 def test_a_single_plane_of_voxels_has_no_differences_across_it():
     rng = np.random.default_rng(4)
     forward, backward, entry = random_links(rng, shape=(9, 8, 1))
-    u = rng.normal(size=entry.max() + 1)
-    normal = unit(rng.normal(size=(3, entry.max() + 1)) * [[1], [1], [0]])
-    arguments = (normal, forward, backward, (1.0, 1.5, 1.0), steps.R, True, 0.8, 0.1)
-    got = take_step(steps.symmetric, u, *arguments)[0]
-    assert np.allclose(got, reference.symmetric(u, *arguments)[0], atol=1e-13)
-    other = take_step(steps.symmetric, u, *arguments[:3], (1.0, 1.5, 77.0), *arguments[4:])[0]
-    assert np.array_equal(got, other)
+    u, normal = random_values(rng, 2, entry)
+    normal = unit(normal * [[1], [1], [0]])
+    for law in (steps.R, None):
+        got, other = (
+            take_step("symmetric", u, normal, forward, backward, (1.0, 1.5, h), law, True, 0.8, 0.1)[0]
+            for h in (1.0, 77.0)
+        )
+        twin = reference.symmetric(u, normal, forward, backward, (1.0, 1.5, 1.0), coupling_of(law), True, 0.8, 0.1)
+        assert np.allclose(got, twin[0], atol=1e-13)
+        assert np.array_equal(got, other)
 
 
 # --- interpolation ----------------------------------------------------------------------------------------------------
@@ -137,9 +206,35 @@ def interpolated(volume, entry, start, at, forward, backward):
     offset = (at - voxel).astype(np.float32)
     nodes = tuple(4 if n > 1 else 1 for n in entry.shape)
     origin = interpolate.stencil_origins(start, offset, forward, backward, nodes)
-    got = np.full(len(start), np.nan, np.float32)
-    interpolate.cubic(volume[entry >= 0].astype(np.float32), origin, offset, forward, nodes, got)
-    return got, np.array([reference.cubic_at(volume, p) for p in (voxel + offset).T])
+    got = np.full((1, len(start)), np.nan, np.float32)
+    u = volume[entry >= 0].astype(np.float32)[None]
+    interpolate.cubic(u, np.empty(0, np.float32), origin, offset, forward, nodes, got)
+    return got[0], np.array([reference.cubic_at(volume, p) for p in (voxel + offset).T])
+
+
+@pytest.mark.parametrize("shape", [(9, 8, 7), (12, 11, 1)])
+def test_cubic_of_channels(shape):
+    """Each clamped by itself, or all as one vector by its length; a NaN in one channel keeps what was there in all."""
+    rng = np.random.default_rng(7)
+    forward, backward, entry = random_links(rng, shape, absent=0, cut=0)
+    volumes = rng.normal(size=(3, *shape)) + 0.5
+    volumes[1].flat[rng.choice(volumes[1].size, 2)] = np.nan
+    start = rng.integers(0, entry.size, 300).astype(np.int32)
+    offset = rng.uniform(-1, 1, (3, 300)) * (np.array(shape) > 1)[:, None]
+    at = np.argwhere(entry >= 0)[start] + offset.T
+    nodes = tuple(4 if n > 1 else 1 for n in shape)
+    origin = interpolate.stencil_origins(start, offset, forward, backward, nodes)
+    u = volumes.reshape(3, -1)
+    for size, twin in [
+        (np.empty(0), lambda p: [reference.cubic_at(volume, p) for volume in volumes]),
+        (np.sqrt((u**2).sum(0)), lambda p: reference.cubic_vector_at(volumes, p)),
+    ]:
+        got, expected = np.full((3, 300), -99.0), np.array([twin(p) for p in at]).T
+        interpolate.cubic(u, size, origin, offset, forward, nodes, got)
+        missing = np.isnan(expected).any(0)
+        assert 30 < missing.sum() < 290
+        assert np.all(got[:, missing] == -99)
+        assert np.allclose(got[:, ~missing], expected[:, ~missing], atol=1e-12)
 
 
 def test_cubic_is_exact_for_cubics_and_stays_within_its_cell():
@@ -153,12 +248,12 @@ def test_cubic_is_exact_for_cubics_and_stays_within_its_cell():
         (x * (x - 4.3) * (x - 11), lambda t: t * (t - 4.3) * (t - 11)),
         (np.where(x > 4, 1.0, 0.0), lambda t: np.clip(t - 4, 0, 1)),  # the unclamped cubic overshoots by 0.07
     ]:
-        got = np.empty(61)
-        interpolate.cubic(np.repeat(u, 16), origin, offset, forward, (4, 4, 4), got)
+        got = np.empty((1, 61))
+        interpolate.cubic(np.repeat(u, 16)[None], np.empty(0), origin, offset, forward, (4, 4, 4), got)
         t = 1 + offset[0]
         if u.max() > 1:
             inside = (t < 1.9) | (t > 3)  # elsewhere the cubic's own turning point lies above its cell's nodes
-            assert np.allclose(got[inside], expected(t)[inside], rtol=1e-6, atol=1e-5)
+            assert np.allclose(got[0, inside], expected(t)[inside], rtol=1e-6, atol=1e-5)
         assert got.min() >= u.min() and got.max() <= u.max()
 
 
@@ -166,15 +261,22 @@ def test_cubic_is_exact_for_cubics_and_stays_within_its_cell():
 def test_linear(least):
     rng = np.random.default_rng(3)
     forward, backward, entry = random_links(rng)
-    u = np.where(rng.random(entry.max() + 1) < 0.2, np.nan, rng.normal(size=entry.max() + 1)).astype(np.float32)
-    start = rng.integers(0, len(u), 500).astype(np.int32)
+    u = rng.normal(size=(2, entry.max() + 1)).astype(np.float32)
+    confidence = rng.uniform(0.1, 1, u.shape[1]).astype(np.float32)
+    missing = rng.random(u.shape[1]) < 0.2
+    u[:, missing], confidence[missing] = np.nan, 0
+    start = rng.integers(-1, u.shape[1], 500).astype(np.int32)
     offset = rng.uniform(-2.5, 2.5, (3, 500)).astype(np.float32)
     offset[:, :50] = np.round(offset[:, :50])
-    got = np.full(500, -99, np.float32)
-    interpolate.linear(u, start, offset, forward, backward, least, got)
+    total, mass = np.full((2, 500), 7.0), np.full(500, 3.0)
+    interpolate.linear(u, confidence, start, offset, forward, backward, least, total, mass)
+    place = forward, backward, least
     for m in range(500):
-        expected = reference.linear_at(u, start[m], offset[:, m].astype(float), forward, backward, least)
-        assert got[m] == -99 if expected is None else abs(got[m] - expected) < 1e-5
+        expected = np.zeros(2), 0.0
+        if start[m] >= 0:
+            expected = reference.linear_at(u.astype(float), confidence, start[m], offset[:, m].astype(float), *place)
+        assert np.abs(total[:, m] - 7 - expected[0]).max() < 1e-5 and abs(mass[m] - 3 - expected[1]) < 1e-5
+    assert 0.1 < (mass == 3).mean() < 0.9
 
 
 # --- extension --------------------------------------------------------------------------------------------------------
@@ -198,11 +300,26 @@ def test_flood():
     rng = np.random.default_rng(6)
     forward, backward, entry = random_links(rng, (8, 7, 6), absent=0.5, cut=0.2)  # falls into several pieces
     count = entry.max() + 1
-    u = np.where(rng.random(count) < 0.9, np.nan, rng.normal(size=count)).astype(np.float32)
-    expected = reference.flood(u, forward, backward)
+    u = rng.normal(size=(2, count)).astype(np.float32)
+    u[:, rng.random(count) < 0.9] = np.nan
+    expected = np.stack([reference.flood(channel, forward, backward) for channel in u])
     assert 0 < np.isnan(expected).sum() < np.isnan(u).sum()
     extend.flood(u, forward, backward)
     assert np.allclose(u, expected, atol=1e-6, equal_nan=True)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_relax(channels):
+    """Harmonic to the tolerance asked for; the fixed entries, of whatever value, stay as they are."""
+    rng = np.random.default_rng(9)
+    forward, backward, entry = random_links(rng, (7, 6, 5), absent=0.05, cut=0.03)
+    u = rng.normal(size=(channels, entry.max() + 1))
+    free = np.flatnonzero(rng.random(u.shape[1]) < 0.6).astype(np.int32)
+    expected = reference.harmonic(u, free, forward, backward, SPACINGS[1])
+    start = u.copy()
+    extend.relax(u, free, forward, backward, np.array(SPACINGS[1]), 1e-12, 500)
+    assert np.abs(u - expected).max() < 1e-9 < np.abs(start - expected).max()
+    assert np.array_equal(np.delete(u, free, 1), np.delete(start, free, 1))
 
 
 # --- geometry ---------------------------------------------------------------------------------------------------------

@@ -178,11 +178,12 @@ def test_sphere_in_the_world():
     psi = np.linalg.norm(x, axis=1).reshape(shape) - radius
     data = (x @ [1.0, 2.0, 2.0] / 3).reshape(shape)
     band = build_band(psi, grid, 4 * 1.28)
-    found = surface_mesh(band, band.gather(data))
+    found, values = surface_mesh(band, np.stack([band.gather(data), -2 * band.gather(data)]))
     at = found.vertices_ras_mm - centre
     assert np.abs(np.linalg.norm(at, axis=1) - radius).max() < 0.1
     assert abs(volume_inside(at, found.cells) / (4 / 3 * np.pi * radius**3) - 1) < 0.02
-    assert np.abs(found.values - at @ [1.0, 2.0, 2.0] / 3).max() < 1e-3
+    assert np.abs(values - np.outer([1, -2], at @ [1.0, 2.0, 2.0] / 3)).max() < 1e-3
+    assert found.values is None and surface_mesh(band)[1] is None
 
 
 @pytest.mark.parametrize("axes", [2, 3])

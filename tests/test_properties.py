@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_band import band_of
 
 from beltrami_cli import denoise, phantoms
+from beltrami_cli.extension import EXTENSIONS, Reextension, extend
+from beltrami_cli.flows import FLOWS, SCHEMES, Flow, Stepper
+from beltrami_cli.sampling import surface_mesh
 
 few = settings(max_examples=6)
 seeds = st.integers(0, 2**31)
@@ -138,3 +142,82 @@ def test_inputs_are_left_as_they_are():
     kept = data.copy()
     run(data, psi)
     assert np.array_equal(data, kept, equal_nan=True) and np.array_equal(psi, BALL.levelset)
+
+
+# --- angles: nothing may depend on where 0 is -------------------------------------------------------------------------
+
+
+def course(own, known, flow, method, turns):
+    """Channels (2, E) at the band's entries and at its mesh's vertices after 30 steps, from samples with a hole."""
+    start = extend(BAND, np.where(known, own, np.nan), known.astype(own.dtype), method, turns=turns)
+    step, again = Stepper(flow, BAND, own.dtype, 2), Reextension(BAND, turns=turns)
+    u, out = start.values.copy(), np.empty_like(own)
+    for k in range(30):
+        step(u, out, 0.5, 0.15)
+        u, out = out, u
+        if k % 5 == 4:
+            again(u, out)
+            u, out = out, u
+    at_vertices = surface_mesh(BAND, u, turns=turns)[1]
+    assert at_vertices is not None and np.isfinite(at_vertices).all()
+    return u, at_vertices
+
+
+def off_by(flow, method, dtype, turns=True, by=1.234):
+    """The most that turning the angles first and turning the results differ by: channels, degrees at the vertices."""
+    rng = np.random.default_rng(12)
+    angle = rng.normal(0.1 * BAND.gather(np.indices(BAND.grid.shape)[0]), 0.8)
+    known = BAND.gather(np.indices(BAND.grid.shape)[2]) < 15
+    turn = np.array([[np.cos(by), -np.sin(by)], [np.sin(by), np.cos(by)]])
+    (first, at_first), (second, at_second) = (
+        course(np.stack([np.cos(a), np.sin(a)]).astype(dtype), known, flow, method, turns) for a in (angle, angle + by)
+    )
+    x, y = (at[0].astype(complex) + 1j * at[1] for at in (at_first, at_second))
+    return np.abs(turn @ first - second).max(), np.degrees(np.abs(np.angle(y / x * np.exp(-1j * by)))).max()
+
+
+BAND = band_of(BALL.levelset)
+
+
+@pytest.mark.parametrize(("dtype", "channels", "degrees"), [(np.float64, 1e-12, 1e-9), (np.float32, 2e-6, 2e-3)])
+@pytest.mark.parametrize("method", EXTENSIONS)
+@pytest.mark.parametrize("name", FLOWS)
+def test_turned_angles_give_turned_results(name, method, dtype, channels, degrees):
+    for scheme in SCHEMES:
+        apart, turned = off_by(Flow(name, scheme=scheme), method, dtype)
+        assert apart < channels and turned < degrees
+
+
+def test_bounds_of_each_channel_would_not_turn():
+    apart, turned = off_by(Flow(), "closest-point", np.float64, turns=False)
+    assert apart > 1e-5 and turned > 1e-3
+
+
+@few
+@given(
+    seed=seeds, flow=flows, scheme=schemes, extension=st.sampled_from(EXTENSIONS),
+    period=st.sampled_from([360.0, 2 * np.pi, 24.0]), by=st.floats(0, 1), depth=st.sampled_from([None, (-1.0, 1.5)]),
+)  # fmt: skip
+def test_turned_angles_give_turned_volumes(seed, flow, scheme, extension, period, by, depth):
+    rng = np.random.default_rng(seed)
+    data = rng.uniform(0, period, (24, 24, 24)) / 2 + rng.uniform(0, period) / 2
+    data[rng.random(data.shape) < 0.2] = np.nan
+    options = {"kind": "circular", "period": period, "precision": "float64", "scheme": scheme, "extension": extension}
+    if extension == "closest-point":
+        options["depth"] = depth
+    turned = (data + by * period) % period
+    first, second = (run(d, FOLD.levelset, **options, **flow) for d in (data, turned))
+    assert np.nanmin(second) >= 0 and np.nanmax(second) < period
+    gap = (second - first - by * period + period / 2) % period - period / 2
+    assert np.array_equal(np.isnan(first), np.isnan(second))
+    assert np.nanmax(np.abs(gap)) < 1e-6 * period
+
+
+@pytest.mark.parametrize("options", [{"kind": "circular", "period": 360.0}, {"kind": "vector"}])
+def test_constants_are_fixed_whatever_the_kind(options):
+    values = (
+        np.full((24, 24, 24), 359.9) if options["kind"] == "circular" else np.tile([3.0, -1e4, 0.0], (24, 24, 24, 1))
+    )
+    got = run(values, FOLD.levelset, beta=0.05, **options)
+    apart = np.abs(got - values)
+    assert np.nanmax(apart / np.maximum(np.abs(values), 1)) < 1e-5 and np.isfinite(got).any()

@@ -12,7 +12,34 @@ from beltrami_cli.cli.common import Command, announce_compilation, note, overwri
 FILE = click.Path(path_type=Path)
 
 
-@click.command(cls=Command)
+# Headings of --help, each by the first option under it.
+HEADINGS = {
+    "volume": "Files",
+    "flow": "Flow",
+    "iterations": "How long",
+    "kind": "Values",
+    "extension": "Surface and band",
+    "outside": "Output and machine",
+}
+
+
+class Denoise(Command):
+    """The command with its many options under headings."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        sections: dict[str, list[tuple[str, str]]] = {}
+        heading = ""
+        for option in self.get_params(ctx):
+            heading = HEADINGS.get(option.name or "", heading)
+            line = option.get_help_record(ctx)
+            if line is not None and isinstance(option, click.Option):
+                sections.setdefault(heading, []).append(line)
+        for heading, lines in sections.items():
+            with formatter.section(heading):
+                formatter.write_dl(lines)
+
+
+@click.command(cls=Denoise)
 @click.argument("inputs", nargs=-1, type=FILE, metavar="LEVELSET DATA")
 @click.option(
     "-o", "--output", "volume", type=FILE, metavar="OUT", help="The denoised volume (.nii.gz .mha .npy .mgz)."
@@ -24,9 +51,18 @@ FILE = click.Path(path_type=Path)
     help="The surface with the denoised values; may be repeated. Default: beside OUT.",
 )
 @click.option("--no-mesh", is_flag=True, default=None, help="Write no mesh.")
+@click.option("--filled", type=FILE, help="A mask of the voxels that had no value and got one.")
+@click.option("--weights", type=FILE, help="How much each voxel of DATA counts: R^2, coherence ...; 0 or more.")
+@click.option("--mask", type=FILE, help="Which voxels of DATA count: those where it is not 0. All else is missing.")
+@click.option("--spacing", metavar="S|SX,SY,SZ", help="Voxel size in mm of .npy inputs. Default: 1.")
+@click.option("--resample", is_flag=True, default=None, help="Bring DATA onto LEVELSET's grid (trilinear).")
 @click.option("--config", type=FILE, help="A TOML file with any of this; the command line overrides it.")
 @overwrite_option
-@click.option("--flow", type=click.Choice(["beltrami", "l2", "l1", "tv", "phi"]), help="Default: beltrami.")
+@click.option(
+    "--flow",
+    type=click.Choice(["beltrami", "l2", "l1", "tv", "phi", "auto"]),
+    help="auto: l2, beltrami, tv or Perona-Malik, chosen by held-out data. Default: beltrami.",
+)
 @click.option(
     "--phi",
     type=click.Choice(["charbonnier", "perona-malik", "geman-mcclure", "weickert"]),
@@ -36,8 +72,9 @@ FILE = click.Path(path_type=Path)
     "--beta",
     metavar="B|A:B[:LAW]|B1,B2,..|auto",
     help="Keeps edges steeper than 1/beta (beta in mm per data unit): a number, a run from A to B (linear or "
-    "geometric), equal stretches of several, or auto: 1 / the data's median slope, noise included. Default: auto.",
+    "geometric), equal stretches of several, or auto: chosen by held-out data. Default: auto.",
 )
+@click.option("--edge", type=float, metavar="SLOPE", help="The same as a slope in data units per mm: beta = 1/SLOPE.")
 @click.option(
     "--eps", type=float, help="Slope (data units per mm) under which l1 and tv smooth. Default: a tenth of median."
 )
@@ -47,11 +84,39 @@ FILE = click.Path(path_type=Path)
     help="symmetric: second order (default). paper: Sec. 4.1, first order; with unit normals and beta |N|^2 as in "
     "Eq. 20, for the printed weights |N| blow up inside thin sulci.",
 )
+@click.option(
+    "--fidelity",
+    type=float,
+    metavar="L",
+    help="Pull back to DATA: adds L w (U0 - U) to the flow, L in 1/mm^2, w the weights; where w is 0 it paints in.",
+)
+@click.option("--dt", metavar="DT|auto", help="Time step in mm^2. Default: 0.9 of the stability bound.")
 @click.option("--flat", is_flag=True, default=None, help="No surface: the flow of Eqs. 10-11; LEVELSET is omitted.")
 @click.option("--iterations", type=int, help="How many steps. Default: 20.")
 @click.option("--time", type=float, help="How long to flow, in mm^2, in place of --iterations.")
 @click.option("--fwhm", type=float, help="The same as the FWHM in mm of the Gaussian that l2 would equal.")
-@click.option("--dt", metavar="DT|auto", help="Time step in mm^2. Default: 0.9 of the stability bound.")
+@click.option(
+    "--stop",
+    type=click.Choice(["auto", "discrepancy", "decorrelation"]),
+    help="Let the data say. auto: least error at held-out data. discrepancy: as much is removed as there is noise. "
+    "decorrelation: what is removed is least correlated with what stays (l2, tv, phi).",
+)
+@click.option(
+    "--noise-sigma", type=float, metavar="S", help="The noise in data units for discrepancy. Default: estimated."
+)
+@click.option("--seed", type=int, help="Of all that is drawn, as held-out data are. Default: 0.")
+@click.option(
+    "--kind",
+    type=click.Choice(["scalar", "circular", "vector"]),
+    help="circular: angles, which wrap. vector: the last axis of DATA holds channels, whose edges are shared. "
+    "Default: scalar.",
+)
+@click.option("--period", metavar="P", help="Of circular data, in their unit: 360, 2pi, 24 ...")
+@click.option("--independent", is_flag=True, default=None, help="A vector's channels run apart, as scalars do.")
+@click.option("--missing", type=float, metavar="VALUE", help="A value of DATA that means none, as NaN always does.")
+@click.option(
+    "--fill", type=float, metavar="MM", help="Fill in no farther than this along the surface. Default: no limit."
+)
 @click.option(
     "--extension",
     type=click.Choice(["closest-point", "pde", "none"]),
@@ -59,10 +124,16 @@ FILE = click.Path(path_type=Path)
 )
 @click.option("--extend-every", type=int, metavar="K", help="Steps between re-extensions, 0 for never. Default: 5.")
 @click.option(
-    "--band", type=float, metavar="MM", help="Half-width of the band. Default: 4 voxels of the largest spacing."
+    "--depth",
+    metavar="A:B",
+    help="Average DATA along the normal from A to B mm (outward is positive) before the flow, as in --depth=-2:2.",
 )
-@click.option("--spacing", metavar="S|SX,SY,SZ", help="Voxel size in mm of .npy inputs. Default: 1.")
-@click.option("--resample", is_flag=True, default=None, help="Bring DATA onto LEVELSET's grid (trilinear).")
+@click.option(
+    "--band",
+    type=float,
+    metavar="MM",
+    help="Half-width of the band. Default: 4 voxels of the largest spacing, or what --depth needs.",
+)
 @click.option("--inside", type=click.Choice(["negative", "positive"]), help="Psi's sign inside. Default: negative.")
 @click.option(
     "--outside", type=click.Choice(["nan", "zero", "keep"]), help="What OUT holds beyond the band. Default: nan."
@@ -97,21 +168,53 @@ def denoise(inputs: tuple[Path, ...], config: Path | None, quiet: bool, verbose:
     return 0
 
 
-def summary(record: dict[str, Any]) -> tuple[str, str]:
-    """What was written, and what was done."""
+def summary(record: dict[str, Any]) -> list[str]:
+    """What was written, what was done, and what was chosen, if anything was."""
     removed = record["Removed"]["rms"]
     amount = "no noise measured" if removed is None else f"noise removed {removed:.4g} rms"
-    seconds = sum(record["Seconds"].values())
-    reason = f"stopped by {record['StopReason']}"
-    return (
-        f"wrote {', '.join(record['Outputs'])}",
-        f"{amount}, {record['Iterations']} iterations, {reason}, {seconds:.1f} s",
-    )
+    done = [
+        amount + _noise(record.get("Noise", {})),
+        *_smoothness(record.get("Smoothness", {})),
+        f"{record['Iterations']} iterations",
+        f"stopped by {record['StopReason']}",
+        f"{sum(record['Seconds'].values()):.1f} s",
+    ]
+    lines = [f"wrote {', '.join(record['Outputs'])}", ", ".join(done)]
+    if record.get("Choice"):
+        lines.append(f"chosen by held-out data: {_combination(record['Choice'])}")
+    return lines
+
+
+def _noise(found: dict[str, Any]) -> str:
+    """The noise as estimated, a number per channel; of many channels the least and the most."""
+    sd = [value for value in found.get("sd") or () if value is not None]
+    if not sd:
+        return ""
+    told = " and ".join(f"{value:.4g}" for value in sd) if len(sd) <= 3 else f"{min(sd):.4g} to {max(sd):.4g}"
+    return f" of {told} estimated"
+
+
+def _smoothness(found: dict[str, Any]) -> list[str]:
+    before, after = found.get("before_mm"), found.get("after_mm")
+    if after is None:
+        return []
+    return [f"smoothness {'' if before is None else f'{before:.3g} to '}{after:.3g} mm FWHM"]
+
+
+def _combination(row: dict[str, Any]) -> str:
+    """A chosen or tried combination in words: the flow, beta and iterations, those it has."""
+    flow, beta, iterations = (row.get(name) for name in ("flow", "beta", "iterations"))
+    words = [
+        row.get("phi") or flow if flow == "phi" else flow,
+        None if beta is None else f"beta {beta:.4g}",
+        None if iterations is None else f"{iterations} iterations",
+    ]
+    return ", ".join(word for word in words if word)
 
 
 def _given(inputs: tuple[Path, ...], options: dict[str, Any]) -> dict[str, Any]:
     """The fields that the command line sets."""
-    from beltrami_cli.config import parse_beta, parse_spacing
+    from beltrami_cli.config import parse_spacing
 
     if len(inputs) > 2:
         extra = " ".join(map(str, inputs[2:]))
@@ -122,8 +225,6 @@ def _given(inputs: tuple[Path, ...], options: dict[str, Any]) -> dict[str, Any]:
         if "mesh" in given:
             raise click.UsageError("--mesh and --no-mesh contradict each other; give one of them")
         given["mesh"] = ()
-    if "beta" in given:
-        given["beta"] = parse_beta(given["beta"])
     if "spacing" in given:
         given["spacing"] = parse_spacing(given["spacing"])
     if "dt" in given:
@@ -151,5 +252,7 @@ def _tell_details(record: dict[str, Any]) -> None:
             f"flow: dt {each['dt'][0]:.5g} mm^2, beta {each['beta'][0]:.5g} to {each['beta'][-1]:.5g}, "
             f"typical slope of the data {record['TypicalSlope']:.5g} per mm",
         )
+    for row in (record.get("Choice") or {}).get("table") or ():
+        note(False, f"held out: {_combination(row)}: error {row['error']:.5g}")
     phases = ", ".join(f"{name} {seconds:.2f}" for name, seconds in record["Seconds"].items())
     note(False, f"seconds: {phases}; peak memory {record['PeakMemoryMiB']} MiB")

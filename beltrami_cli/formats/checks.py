@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from beltrami_cli.errors import BeltramiError, DataError, RefusedError
 
@@ -61,41 +62,70 @@ def require_file(path: Path) -> None:
         raise RefusedError(f"{path}: cannot be opened ({error.strerror}); check its permissions") from error
 
 
-def spatial_shape(path: Path, file_shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """The three spatial axes of an array as stored: trailing axes of length 1 dropped, a plane given one slice.
+def layout(
+    path: Path, axes: tuple[int, ...], *, per_voxel: int = 1, channels: bool = False
+) -> tuple[tuple[int, int, int], int]:
+    """The three spatial axes of an array as stored, a plane given one slice, and the number of values at each voxel.
 
-    Raises RefusedError for several frames, a single line of values or an empty array.
+    axes: the array's shape; behind the third, axes of length 1 do not count, and one other holds channels or frames.
+    per_voxel: numbers that each element is made of (vector and coloured pixels).
+    Raises RefusedError for several values at a voxel without `channels`, for two axes of them, for a single line of
+    values and for an empty array.
     """
-    found = f"{len(file_shape)}-D ({' x '.join(map(str, file_shape))})"
-    if len(file_shape) < 2:
+    found = f"{len(axes)}-D ({' x '.join(map(str, axes))})"
+    if len(axes) < 2:
         raise RefusedError(f"{path}: expected a volume of 2 or 3 axes; found {found}")
-    if 0 in file_shape:
+    if 0 in axes:
         raise RefusedError(f"{path}: expected values; found an empty array, {found}")
-    if max(file_shape[3:], default=1) > 1:
-        axes = ", ".join(("x", "y", "z", *map(str, file_shape[3:])))
+    several = [n for n in (*axes[3:], per_voxel) if n > 1]
+    if len(several) > 1:
         raise RefusedError(
-            f"{path}: several frames are not supported yet: found {len(file_shape)}-D ({axes}); extract one frame"
+            f"{path}: expected one axis of channels or frames behind x, y, z; found {len(several)}, of lengths "
+            f"{' and '.join(map(str, several))}; extract one frame"
         )
-    nx, ny, nz = (*file_shape, 1)[:3]
+    if several and not channels:
+        raise RefusedError(
+            f"{path}: expected one number per voxel; found {_several(axes, per_voxel)}; extract one, or, as data to "
+            "denoise, give --kind vector (all together; with --independent one after another)"
+        )
+    nx, ny, nz = (*axes, 1)[:3]
     on_mesh = nx * ny * nz in _SURFACE_SIZES
     # Long rows of vertices are also stored folded (fsaverage as 27307 x 1 x 6).
-    folded = on_mesh and len(file_shape) > 2 and 1 in (nx, ny, nz)
+    folded = on_mesh and len(axes) > 2 and 1 in (nx, ny, nz)
     if sorted((nx, ny, nz))[1] == 1 or folded:
         guess = f", {nx * ny * nz} values as on a cortical mesh" if on_mesh else ""
         raise RefusedError(
             f"{path}: expected a volume or a plane; found {found}{guess}: data of a surface or a time course, "
             "not of voxels; give the volume instead"
         )
-    return nx, ny, nz
+    return (nx, ny, nz), (several or [1])[0]
 
 
-def require_real(path: Path, dtype: np.dtype) -> None:
-    """Raise RefusedError unless pixels of this type are single real numbers."""
-    if dtype.kind == "c":
-        raise RefusedError(f"{path}: expected real values; found complex ones ({dtype}); extract magnitude or phase")
-    if dtype.kind not in "fiub":
-        what = "vector or RGB pixels" if dtype.names else f"values of type {dtype}"
-        raise RefusedError(f"{path}: expected one number per voxel; found {what}; extract one channel")
+def _several(axes: tuple[int, ...], per_voxel: int) -> str:
+    if per_voxel > 1:
+        return f"{per_voxel} channels in each (vector or coloured pixels)"
+    return f"several channels or frames, {len(axes)}-D ({', '.join(('x', 'y', 'z', *map(str, axes[3:])))})"
+
+
+def require_numbers(path: Path, dtype: np.dtype, count: int, *, channels: bool = False) -> None:
+    """Raise RefusedError unless voxels of this type are real numbers, or, with `channels`, one complex number each."""
+    if dtype.kind == "c" and not channels:
+        raise RefusedError(
+            f"{path}: expected real values; found complex ones ({dtype}); extract magnitude or phase, or, as data to "
+            "denoise, give --kind vector (real and imaginary part together)"
+        )
+    if dtype.kind == "c" and count > 1:
+        raise RefusedError(
+            f"{path}: expected one complex number per voxel; found {count} of them ({dtype}); extract one frame, or "
+            "store real and imaginary parts as channels"
+        )
+    if dtype.kind not in "fiubc":
+        raise RefusedError(f"{path}: expected numbers; found values of type {dtype}; convert them")
+
+
+def number_type(asked: DTypeLike, found: np.dtype) -> np.dtype:
+    """The type to hold values of type `found` in: `asked`, or its complex twin (float32 -> complex64) for complex ones."""
+    return np.result_type(asked, np.complex64) if found.kind == "c" else np.dtype(asked)
 
 
 def require_usable_affine(path: Path, affine: np.ndarray) -> None:

@@ -32,31 +32,33 @@ def transport(u, normal, distance, forward, backward, spacing, width, dt, out):
 
 @nb.njit(cache=True)
 def flood(u, forward, backward):
-    """Fill NaN entries of u in place, ring by ring, each with the mean of its linked entries of the rings before.
+    """Fill NaN entries of u (K, E) in place, ring by ring, each with the mean of its linked entries of the rings before.
 
     Entries of a bank without any known value stay NaN.
     """
-    unknown = np.flatnonzero(np.isnan(u)).astype(np.int32)
+    channels = len(u)
+    unknown = np.flatnonzero(np.isnan(u[0])).astype(np.int32)
     left = len(unknown)
-    values = np.empty(left, u.dtype)
+    values = np.empty((channels, left), u.dtype)
     while True:
         kept = 0
         for k in range(left):
             m = unknown[k]
-            total, count = 0.0, 0
-            for a in range(3):
-                for e in (forward[a, m], backward[a, m]):
-                    if not np.isnan(u[e]):
-                        total += u[e]
-                        count += 1
-            values[k] = total / count if count else np.nan
+            for c in range(channels):
+                total, count = 0.0, 0
+                for a in range(3):
+                    for e in (forward[a, m], backward[a, m]):
+                        if not np.isnan(u[c, e]):
+                            total += u[c, e]
+                            count += 1
+                values[c, k] = total / count if count else np.nan
         for k in range(left):
             m = unknown[k]
-            if np.isnan(values[k]):
+            if np.isnan(values[0, k]):
                 unknown[kept] = m
                 kept += 1
             else:
-                u[m] = values[k]
+                u[:, m] = values[:, k]
         if kept == left:
             return
         left = kept
@@ -64,24 +66,27 @@ def flood(u, forward, backward):
 
 @nb.njit(cache=True, parallel=True)
 def relax(u, free, forward, backward, spacing, tolerance, iterations):
-    """Make u (E,) float64 harmonic over links at the `free` entries (F,), the others fixed, in place.
+    """Make u (K, E) float64 harmonic over links at the `free` entries (F,), the others fixed, in place.
 
-    Conjugate gradients on the 7-point Laplacian from u as it stands, until the residual has fallen by `tolerance` or
-    after `iterations`. Sums run over blocks of fixed size, whatever the number of threads.
+    Conjugate gradients on the 7-point Laplacian of all channels as one system, so that turning two channels into each
+    other turns the result; from u as it stands, until the residual has fallen by `tolerance` or after `iterations`. Sums
+    run over blocks of fixed size, whatever the number of threads.
     """
+    channels = len(u)
     blocks = (len(free) + BLOCK - 1) // BLOCK
-    residual, direction, image = np.zeros(len(u)), np.zeros(len(u)), np.zeros(len(u))
+    residual, direction, image = np.zeros(u.shape), np.zeros(u.shape), np.zeros(u.shape)
     part = np.zeros(blocks)
     w = (1 / spacing[0] ** 2, 1 / spacing[1] ** 2, 1 / spacing[2] ** 2)
     for block in nb.prange(blocks):
         share = 0.0
         for k in range(block * BLOCK, min(len(free), (block + 1) * BLOCK)):
             m = free[k]
-            pull = 0.0
-            for a in range(3):
-                pull += w[a] * (u[forward[a, m]] + u[backward[a, m]] - 2 * u[m])
-            residual[m] = direction[m] = pull
-            share += pull * pull
+            for c in range(channels):
+                pull = 0.0
+                for a in range(3):
+                    pull += w[a] * (u[c, forward[a, m]] + u[c, backward[a, m]] - 2 * u[c, m])
+                residual[c, m] = direction[c, m] = pull
+                share += pull * pull
         part[block] = share
     size = total(part)
     target = tolerance * tolerance * size
@@ -92,22 +97,25 @@ def relax(u, free, forward, backward, spacing, tolerance, iterations):
             share = 0.0
             for k in range(block * BLOCK, min(len(free), (block + 1) * BLOCK)):
                 m = free[k]
-                bend = 0.0
-                for a in range(3):
-                    bend += w[a] * (2 * direction[m] - direction[forward[a, m]] - direction[backward[a, m]])
-                image[m] = bend
-                share += bend * direction[m]
+                for c in range(channels):
+                    bend = 0.0
+                    for a in range(3):
+                        bend += w[a] * (2 * direction[c, m] - direction[c, forward[a, m]] - direction[c, backward[a, m]])
+                    image[c, m] = bend
+                    share += bend * direction[c, m]
             part[block] = share
         stride = size / total(part)
         for block in nb.prange(blocks):
             share = 0.0
             for k in range(block * BLOCK, min(len(free), (block + 1) * BLOCK)):
                 m = free[k]
-                u[m] += stride * direction[m]
-                residual[m] -= stride * image[m]
-                share += residual[m] * residual[m]
+                for c in range(channels):
+                    u[c, m] += stride * direction[c, m]
+                    residual[c, m] -= stride * image[c, m]
+                    share += residual[c, m] * residual[c, m]
             part[block] = share
         turn = total(part) / size
         size *= turn
         for k in nb.prange(len(free)):
-            direction[free[k]] = residual[free[k]] + turn * direction[free[k]]
+            for c in range(channels):
+                direction[c, free[k]] = residual[c, free[k]] + turn * direction[c, free[k]]

@@ -87,17 +87,43 @@ def cubic_weights(t, nodes, w):
     w[3] = (t + 1) * t * (t - 1) / 6
 
 
-@nb.njit(cache=True, parallel=True, fastmath=FAST)
-def cubic(u, origin, offset, forward, nodes, out):
-    """Local cubic of u at each query, within the range of the cell's own nodes, into out (Q,).
+@nb.njit(cache=True, fastmath=FAST)
+def cubic_sum(u, x, w0, w1, w2, nodes, f0, f1, f2):
+    """The weighted sum of u (E,) over the stencil whose origin is x, and the least and the most of the cell's nodes."""
+    total, low, high = u[x] * 0, u.dtype.type(np.inf), u.dtype.type(-np.inf)
+    for a in range(nodes[0]):
+        y = x
+        for b in range(nodes[1]):
+            if nodes[2] == 1:
+                row, least, most = u[y], u[y], u[y]
+            else:
+                z1 = f2[y]
+                z2 = f2[z1]
+                row = w2[0] * u[y] + w2[1] * u[z1] + w2[2] * u[z2] + w2[3] * u[f2[z2]]
+                least, most = min(u[z1], u[z2]), max(u[z1], u[z2])
+            if (nodes[0] == 1 or a == 1 or a == 2) and (nodes[1] == 1 or b == 1 or b == 2):
+                low, high = min(low, least), max(high, most)
+            total += w0[a] * w1[b] * row
+            y = f1[y]
+        x = f0[x]
+    return total, low, high
 
-    `origin` and `offset` as for `stencil_origins`. Where the stencil is incomplete (-1) or holds a NaN, out keeps its
-    value.
+
+@nb.njit(cache=True, parallel=True, fastmath=FAST)
+def cubic(u, size, origin, offset, forward, nodes, out):
+    """Local cubic of u (K, E) at each query, into out (K, Q).
+
+    Every channel stays within the range of the cell's own nodes; or, where size (E,) holds |u| (else it is empty), the
+    vector of all channels within their greatest length, which is the same however two channels are turned into each
+    other. `origin` and `offset` as for `stencil_origins`. Where the stencil is incomplete (-1) or holds a NaN, out keeps
+    its value.
     """
     f0, f1, f2 = forward[0], forward[1], forward[2]
-    queries = len(origin)
+    channels, queries = len(u), len(origin)
+    by_length = len(size) > 0
     for chunk in nb.prange((queries + BLOCK - 1) // BLOCK):
         w0, w1, w2 = np.empty(4, u.dtype), np.empty(4, u.dtype), np.empty(4, u.dtype)
+        values = np.empty(channels, u.dtype)
         for m in range(chunk * BLOCK, min(queries, (chunk + 1) * BLOCK)):
             if origin[m] < 0:
                 continue
@@ -105,44 +131,50 @@ def cubic(u, origin, offset, forward, nodes, out):
             cubic_weights(offset[0, m] - np.floor(offset[0, m]), nodes[0], w0)
             cubic_weights(offset[1, m] - np.floor(offset[1, m]), nodes[1], w1)
             cubic_weights(offset[2, m] - np.floor(offset[2, m]), nodes[2], w2)
-            total, low, high = u[x] * 0, u.dtype.type(np.inf), u.dtype.type(-np.inf)
-            for a in range(nodes[0]):
-                y = x
-                for b in range(nodes[1]):
-                    if nodes[2] == 1:
-                        row, least, most = u[y], u[y], u[y]
-                    else:
-                        z1 = f2[y]
-                        z2 = f2[z1]
-                        row = w2[0] * u[y] + w2[1] * u[z1] + w2[2] * u[z2] + w2[3] * u[f2[z2]]
-                        least, most = min(u[z1], u[z2]), max(u[z1], u[z2])
-                    if (nodes[0] == 1 or a == 1 or a == 2) and (nodes[1] == 1 or b == 1 or b == 2):
-                        low, high = min(low, least), max(high, most)
-                    total += w0[a] * w1[b] * row
-                    y = f1[y]
-                x = f0[x]
-            if not np.isnan(total):
-                out[m] = min(max(total, low), high)
+            squares = u.dtype.type(0)
+            for k in range(channels):
+                total, low, high = cubic_sum(u[k], x, w0, w1, w2, nodes, f0, f1, f2)
+                values[k] = total if by_length or np.isnan(total) else min(max(total, low), high)
+                squares += values[k] * values[k]
+            if np.isnan(squares):
+                continue
+            if by_length:
+                most = cubic_sum(size, x, w0, w1, w2, nodes, f0, f1, f2)[2]
+                if squares > most * most:
+                    values *= most / np.sqrt(squares)
+            for k in range(channels):
+                out[k, m] = values[k]
 
 
 @nb.njit(cache=True, parallel=True)
-def linear(u, start, offset, forward, backward, least, out):
-    """Trilinear u at each query from the cell's corners that links reach and whose value is not NaN, into out (Q,).
+def linear(u, confidence, start, offset, forward, backward, least, total, mass):
+    """Add to total (K, Q) and mass (Q,) the trilinear sums of confidence times u (K, E) and of confidence (E,) at each query.
 
-    Weights are normalised; where they sum to no more than `least`, out is left as it is.
+    Over the cell's corners that links reach and whose confidence is above 0; where their trilinear weights sum to no
+    more than `least`, nothing is added.
     """
-    for m in nb.prange(len(start)):
-        s0, s1, s2 = int(np.floor(offset[0, m])), int(np.floor(offset[1, m])), int(np.floor(offset[2, m]))
-        t0, t1, t2 = offset[0, m] - s0, offset[1, m] - s1, offset[2, m] - s2
-        total, weight = 0.0, 0.0
-        for corner in range(8):
-            a, b, c = corner >> 2, corner >> 1 & 1, corner & 1
-            w = (t0 if a else 1 - t0) * (t1 if b else 1 - t1) * (t2 if c else 1 - t2)
-            if w == 0.0:
+    channels = len(u)
+    for chunk in nb.prange((len(start) + BLOCK - 1) // BLOCK):
+        sums = np.empty(channels)
+        for m in range(chunk * BLOCK, min(len(start), (chunk + 1) * BLOCK)):
+            if start[m] < 0:
                 continue
-            e = walk(start[m], s0 + a, s1 + b, s2 + c, forward, backward)
-            if e >= 0 and not np.isnan(u[e]):
-                total += w * u[e]
-                weight += w
-        if weight > least:
-            out[m] = total / weight
+            s0, s1, s2 = int(np.floor(offset[0, m])), int(np.floor(offset[1, m])), int(np.floor(offset[2, m]))
+            t0, t1, t2 = offset[0, m] - s0, offset[1, m] - s1, offset[2, m] - s2
+            weight, trust = 0.0, 0.0
+            sums[:] = 0
+            for corner in range(8):
+                a, b, c = corner >> 2, corner >> 1 & 1, corner & 1
+                w = (t0 if a else 1 - t0) * (t1 if b else 1 - t1) * (t2 if c else 1 - t2)
+                if w == 0.0:
+                    continue
+                e = walk(start[m], s0 + a, s1 + b, s2 + c, forward, backward)
+                if e >= 0 and confidence[e] > 0:
+                    weight += w
+                    trust += w * confidence[e]
+                    for k in range(channels):
+                        sums[k] += w * confidence[e] * u[k, e]
+            if weight > least:
+                mass[m] += trust
+                for k in range(channels):
+                    total[k, m] += sums[k]

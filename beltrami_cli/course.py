@@ -1,0 +1,62 @@
+"""One course of a flow on one band: from start values, through the time loop, to where it ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from beltrami_cli.band import Band
+from beltrami_cli.evolve import Evolution, Observer, Schedule, Stop, evolve
+from beltrami_cli.extension import Extended, Reextension, extend
+from beltrami_cli.flows import Fidelity, Flow, Stepper
+from beltrami_cli.kinds import Kind
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What every flow on the same band and kind of value shares.
+
+    dt: mm^2. extend_every: steps between re-extensions, 0 for never. fidelity: L in 1/mm^2. extension, depth: see
+    `extension.extend`.
+    """
+
+    band: Band
+    kind: Kind
+    dt: float
+    scheme: str = "symmetric"
+    extension: str = "closest-point"
+    depth: tuple[float, float] | None = None
+    extend_every: int = 5
+    fidelity: float = 0.0
+
+    @cached_property
+    def reextension(self) -> Reextension | None:
+        return Reextension(self.band, turns=self.kind.is_circular) if self.extend_every else None
+
+    def start(self, own: np.ndarray, trust: np.ndarray) -> Extended:
+        """Start values from own samples (K, E) of weights `trust` (E,); raises as `extend`."""
+        return extend(self.band, own, trust, self.extension, depth=self.depth, turns=self.kind.is_circular)
+
+    def run(
+        self,
+        start: Extended,
+        flow: Flow,
+        schedule: Schedule,
+        observer: Observer | None = None,
+        stop: Stop | None = None,
+    ) -> tuple[Evolution, int]:
+        """Where `flow` leads from the start values, NaN where those are, and the most substeps that a step took."""
+        u0 = start.values
+        lost = np.isnan(u0[0])
+        if lost.any():
+            u0 = np.where(lost, 0, u0)  # linked to nothing but one another
+        pull = Fidelity(u0, (self.fidelity * start.confidence).astype(u0.dtype)) if self.fidelity else None
+        stepper = Stepper(
+            flow, self.band, u0.dtype, len(u0),
+            coupled=self.kind.name == "vector", unit=self.kind.unit, fidelity=pull,
+        )  # fmt: skip
+        evolution = evolve(u0, stepper, schedule, self.reextension, self.extend_every, observer, stop)
+        evolution.values[:, lost] = np.nan
+        return evolution, stepper.substeps

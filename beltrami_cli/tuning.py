@@ -1,0 +1,244 @@
+"""Automatic choice of the flow, its beta and when to stop, by data that the flow has not seen; stopping rules.
+
+Some valid voxels near the surface are held out, the data are extended without them, and the flow runs over a path of
+beta. After every iteration its values at the held-out voxels are compared with their data: with noise that is
+independent from voxel to voxel, the mean squared error there is the noise's variance plus the squared error against
+what lies below the noise, so both have their least value together. Iterations are then repeated on all data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from beltrami_cli.band import Band
+from beltrami_cli.course import Course
+from beltrami_cli.errors import DataError
+from beltrami_cli.evolve import Schedule, Stop
+from beltrami_cli.extension import Extended
+from beltrami_cli.flows import Flow
+from beltrami_cli.kinds import Kind
+
+# Voxels are held out 1 to 2 voxels from the surface. Nearer ones make the start values, which would miss them: where
+# one is held out the flow has a gap to fill, and longer runs win that are too long for all data.
+SHELL = (1.0, 2.0)
+HELD_OUT = 0.3  # share of the valid voxels there: 15 % of those within 2 voxels
+LEAST_HELD = 30  # voxels, below which an error says nothing
+LEAST_VOXELS = round(LEAST_HELD / HELD_OUT)
+NEAR = 1.0  # voxels from the surface within which values are looked at for their correlation
+# A curve of error over iterations has passed its least value when it has gone on for a third as long again, and 6 more:
+# longer than from one re-extension to the next.
+PATIENCE = (1.33, 6)
+# A run whose error is above the least so far is given up when it has taken half as long again as that, and 10 more.
+RIVAL = (1.5, 10)
+# Steps of the search over log2 beta: a factor of 4 until the least error lies between two larger ones, then 2 and 1.4.
+FIRST_STEP, LAST_STEP = 2.0, 0.5
+SEARCH_RANGE = 8.0  # |log2 (beta times the typical slope)|: beyond, a flow is l2, or stands still
+CLEAR = 3.0  # standard errors by which the chosen run must beat the start for the choice to mean something
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One run of the path. errors: (n + 1,) mean squared error at the held-out voxels after 0..n iterations."""
+
+    flow: Flow
+    beta: float
+    errors: np.ndarray
+    iterations: int
+    gain: float
+
+    @property
+    def error(self) -> float:
+        return float(self.errors[self.iterations])
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The run of least error, and all that were tried.
+
+    gain: by how many standard errors it beats the start values. at_end: its error was still falling.
+    """
+
+    flow: Flow
+    beta: float
+    iterations: int
+    gain: float
+    at_end: bool
+    held_out: int
+    curves: tuple[Curve, ...] = field(repr=False)
+
+    @property
+    def is_clear(self) -> bool:
+        return self.gain >= CLEAR
+
+    def table(self, kind: Kind) -> list[dict[str, float | int | str | None]]:
+        """Each run's flow, beta (mm per data unit), best iteration and root mean square error there (data units)."""
+        return [
+            {
+                "flow": c.flow.name,
+                "phi": c.flow.phi if c.flow.name == "phi" else None,
+                "beta": c.beta,
+                "iterations": c.iterations,
+                "error": float(np.sqrt(c.error)),
+                "error_at_start": float(np.sqrt(c.errors[0])),
+                "iterations_tried": len(c.errors) - 1,
+            }
+            for c in self.curves
+        ]
+
+
+def hold_out(band: Band, trust: np.ndarray, seed: int) -> np.ndarray:
+    """Entries (H,) of voxels near the surface whose data are held out; trust: (E,) weights, 0 where data are missing.
+
+    Raises DataError where too few voxels hold data.
+    """
+    voxels = np.abs(band.distance) / band.grid.used_spacing.max()
+    inner = np.flatnonzero((trust > 0) & (voxels < SHELL[0]))
+    shell = np.flatnonzero((trust > 0) & (voxels >= SHELL[0]) & (voxels < SHELL[1]))
+    valid = shell if len(shell) > len(inner) / 2 else inner  # data may end near the surface
+    count = round(HELD_OUT * len(valid))
+    if count < LEAST_HELD:
+        raise DataError(
+            f"automatic choice: found {len(valid)} valid voxels beside the surface; expected at least {LEAST_VOXELS} "
+            "to hold some out; give --beta and --iterations"
+        )
+    return np.sort(np.random.default_rng(seed).choice(valid, count, replace=False))
+
+
+@dataclass(frozen=True)
+class Family:
+    """A flow to try. beta: mm per data unit, or None to search for it."""
+
+    flow: Flow
+    beta: float | None
+
+
+def choose(
+    course: Course,
+    own: np.ndarray,
+    trust: np.ndarray,
+    families: list[Family],
+    slope: float,
+    iterations: int,
+    seed: int,
+    *,
+    stop: bool,
+) -> Choice:
+    """The run of least held-out error over `families`, their betas, and, with `stop`, the iterations up to `iterations`.
+
+    own: (K, E) samples of weights trust (E,). slope: typical slope of the data (data units per mm), where the search
+    over beta starts. Without `stop`, runs are compared at their last iteration. Raises DataError where too few voxels hold data.
+    """
+    held = hold_out(course.band, trust, seed)
+    rest, left = own.copy(), trust.copy()
+    rest[:, held], left[held] = np.nan, 0
+    start = course.start(rest, left)
+    weight = trust[held] / trust[held].sum(dtype=float)
+    truth = own[:, held]
+
+    def curve(flow: Flow, beta: float) -> Curve:
+        rival = min(curves, key=lambda c: c.error, default=None)
+        watch = _Watch(course.kind, held, truth, weight, rival, to_end=not stop)
+        course.run(start, flow, Schedule(np.full(iterations, beta), course.dt), stop=watch)
+        curves.append(Curve(flow, beta, np.array(watch.errors), watch.least, watch.gain))
+        return curves[-1]
+
+    curves: list[Curve] = []
+    for family in families:
+        if family.beta is not None or not slope:
+            curve(family.flow, family.beta or 0.0)
+        else:
+            search(lambda x, flow=family.flow: curve(flow, 2.0**x / slope).error)  # type: ignore[misc]
+    best = min(curves, key=lambda c: c.error)
+    return Choice(
+        best.flow, best.beta, best.iterations, best.gain,
+        stop and best.iterations == iterations, len(held), tuple(curves),
+    )  # fmt: skip
+
+
+class _Watch:
+    """Follows the error at the held-out entries (H,) and says when there is nothing more to see (never, with to_end)."""
+
+    def __init__(
+        self, kind: Kind, held: np.ndarray, truth: np.ndarray, weight: np.ndarray, rival: Curve | None, *, to_end: bool
+    ) -> None:
+        self.kind, self.held, self.truth, self.weight, self.to_end = kind, held, truth, weight, to_end
+        self.longest = (np.inf, 0.0) if rival is None else (RIVAL[0] * rival.iterations + RIVAL[1], rival.error)
+        self.errors: list[float] = []
+        self.least = 0
+        self.first = self.best = np.empty(0)
+
+    def __call__(self, k: int, u: np.ndarray) -> str | None:
+        each = self.kind.errors(u[:, self.held], self.truth)
+        self.errors.append(float(self.weight @ each))
+        if k == 0:
+            self.first = self.best = each
+        elif self.to_end or self.errors[k] < self.errors[self.least]:
+            self.least, self.best = k, each
+        passed = k > PATIENCE[0] * self.least + PATIENCE[1]
+        beaten = k > self.longest[0] and self.errors[k] > self.longest[1]
+        return "passed" if not self.to_end and (passed or beaten) else None
+
+    @property
+    def gain(self) -> float:
+        """How much less the error is than at the start, in standard errors of that difference."""
+        fall = (self.first - self.best) * self.weight * len(self.held)
+        spread = float(fall.std()) / np.sqrt(len(self.held))
+        return float(fall.mean()) / spread if spread > 0 else 0.0
+
+
+def search(error: Callable[[float], float]) -> None:
+    """Evaluate `error` at values of x = log2 (beta times slope) that close in on the least."""
+    tried: dict[float, float] = {}
+
+    def at(x: float) -> float:
+        if abs(x) > SEARCH_RANGE:
+            return np.inf
+        if x not in tried:
+            tried[x] = error(x)
+        return tried[x]
+
+    x, step = 0.0, FIRST_STEP
+    while step >= LAST_STEP:
+        nearest = min((x, x - step, x + step), key=at)
+        if nearest == x:
+            step /= 2
+        x = nearest
+
+
+def near_surface(band: Band, trust: np.ndarray) -> np.ndarray:
+    """Entries (N,) of valid voxels within half a voxel of the surface, where input and output show the same place."""
+    return np.flatnonzero((trust > 0) & (np.abs(band.distance) <= 0.5 * band.grid.used_spacing.max()))
+
+
+def discrepancy(course: Course, own: np.ndarray, trust: np.ndarray, sigma: float) -> Stop:
+    """Stops where the flow's values have left the data by the noise's standard deviation sigma (data units).
+
+    Morozov's principle. own: (K, E) of weights trust (E,). Raises DataError where no valid voxel is near the surface.
+    """
+    near = near_surface(course.band, trust)
+    if not len(near):
+        raise DataError("stop discrepancy: found no valid voxel within half a voxel of the surface; give --iterations")
+    data = own[:, near]
+    return lambda k, u: "discrepancy" if course.kind.spread(data, u[:, near]) >= sigma else None
+
+
+def decorrelated(course: Course, start: Extended, flow: Flow, beta: float, iterations: int) -> int:
+    """The iteration at which what the flow has removed is least correlated with what is left (Mrazek, Navara 2003)."""
+    near = np.flatnonzero(start.known & (np.abs(course.band.distance) < NEAR * course.band.grid.used_spacing.max()))
+    first = start.values[:, near].astype(float)
+    found: list[float] = [np.inf]  # at the start nothing is removed
+
+    def watch(k: int, u: np.ndarray) -> str | None:
+        if k:
+            left = u[:, near].astype(float)
+            removed = first - left
+            left, removed = (x - x.mean(1, keepdims=True) for x in (left, removed))
+            size = np.sqrt((left**2).sum() * (removed**2).sum())
+            found.append(abs(float((left * removed).sum())) / size if size > 0 else 0.0)
+        return "passed" if k > PATIENCE[0] * int(np.argmin(found)) + PATIENCE[1] else None
+
+    course.run(start, flow, Schedule(np.full(iterations, beta), course.dt), stop=watch)
+    return int(np.argmin(found))
