@@ -64,10 +64,13 @@ def denoise(
     placed = on_grid(values, "data", settings.kind == "vector")
     assert placed is not None
     threads = numba.get_num_threads()
-    warnings, phases = Warnings(None), Phases()
+    warnings = Warnings(None)
     try:
-        others = [on_grid(None if a is None else _filled_with_nan(a), name) for a, name in ((weights, "weights"), (mask, "mask"))]
-        solver = Solver(on_grid(psi, "levelset"), grid, settings, phases, warnings, *others)
+        solver = Solver(
+            on_grid(psi, "levelset"), grid, settings, Phases(), warnings,
+            on_grid(None if weights is None else _filled_with_nan(weights), "weights"),
+            on_grid(None if mask is None else _filled_with_nan(mask), "mask"),
+        )  # fmt: skip
         solved = _frames(solver, placed) if settings.independent else solver.denoise(placed, observer)
     finally:
         numba.set_num_threads(threads)  # the caller's own choice
@@ -106,7 +109,9 @@ def _shape(values: np.ndarray, psi: np.ndarray | None, settings: Settings) -> tu
         fits = values.shape == shape or (vector and values.shape[:-1] == shape)
         if not fits:
             more = " (several channels need kind='vector')" if values.shape[:-1] == shape else ""
-            raise RefusedError(f"levelset has shape {psi.shape} and data {values.shape}; expected one shape for both{more}")
+            raise RefusedError(
+                f"levelset has shape {psi.shape} and data {values.shape}; expected one shape for both{more}"
+            )
     elif vector and values.ndim > 2:
         shape = values.shape[:-1]
     if len(shape) not in (2, 3):

@@ -54,8 +54,8 @@ def extend(
 ) -> Extended:
     """Carry data off the surface on every sheet.
 
-    own: (K, E), the data at the entries that they belong to (`own_samples`), NaN where missing. confidence: (E,) their
-    weights in 0..1, 0 where missing.
+    own: (K, E), the data at the entries that they belong to (`own_samples`), NaN where missing.
+    confidence: (E,) their weights in 0..1, 0 where missing.
     method: "closest-point" (each entry takes the value of valid voxels at its closest surface point, see
     `at_closest_points`), "pde" (U_t + sign(Psi) grad U . grad Psi = 0, Sec. 2.1) or "none" (each voxel keeps its own
     value; sheets other than the nearest take the closest point's). Holes are then filled from the band around them.
@@ -63,8 +63,9 @@ def extend(
     and sin of an angle, on which nothing may depend on where the angle is 0.
     Raises DataError where no entry is reached by valid data.
     """
+    own = np.where(confidence > 0, own, np.nan)
     if band.surface is None:
-        values, trust = own.copy(), confidence.copy()
+        values, trust = own, confidence
     elif method == "pde":
         values, trust = transported(band, own, confidence)
     else:
@@ -82,10 +83,10 @@ def extend(
     return Extended(values, known, trust)
 
 
-def own_samples(band: Band, samples: np.ndarray) -> np.ndarray:
+def own_samples(band: Band, samples: np.ndarray, *, every: bool = False) -> np.ndarray:
     """(K, E) samples (K, E) at the entries that a voxel's data belong to; NaN at those of the banks behind the nearest.
 
-    A voxel midway between two banks feeds neither: which of them it shows is anyone's guess.
+    A voxel midway between two banks feeds neither (but the nearer one with `every`): which it shows is anyone's guess.
     """
     first = band.primary
     second = np.minimum(first + 1, band.entries - 1)
@@ -93,7 +94,7 @@ def own_samples(band: Band, samples: np.ndarray) -> np.ndarray:
     near, far = band.distance[first], band.distance[second]
     contested = shared & (near * far > 0) & (np.abs(far) - np.abs(near) < MIDWAY * band.finest)
     own = np.full_like(samples, np.nan)
-    own[:, first] = np.where(contested, np.nan, samples[:, first])
+    own[:, first] = np.where(contested & (not every), np.nan, samples[:, first])
     return own
 
 

@@ -99,9 +99,10 @@ class Stepper:
         self.spacing = band.grid.spacing.astype(dtype)
         self.flux, self.work = (np.empty((channels, 3, band.entries), dtype) for _ in range(2))
         self.outer = np.empty(band.entries, dtype)
-        self.metric = coupled and flow.has_outer_factor
+        self.metric = coupled and channels > 1 and flow.has_outer_factor  # of one channel, the metric is r
         if self.metric:
-            self.tensor = np.empty((channels, channels, band.entries), dtype)
+            self.tangents = len(band.grid.used_spacing) - (band.surface is not None)
+            self.tensor = np.empty((6, band.entries), dtype)
             self.largest = np.empty(band.entries, dtype)
         self.substeps = 0  # most that any step so far was divided into
 
@@ -127,7 +128,8 @@ class Stepper:
             source, left, taken = out, left * (1 - 1 / parts), taken + 1
         self.substeps = max(self.substeps, taken)
         if self.fidelity is not None:
-            share = (dt * self.fidelity.rate / (1 + dt * self.fidelity.rate)).astype(u.dtype)
+            with np.errstate(divide="ignore"):
+                share = (1 / (1 + 1 / (dt * self.fidelity.rate))).astype(u.dtype)
             out += share * (self.fidelity.target - out)
         if self.fidelity is not None or taken > 1:
             squares = float(((out - u).astype(float) ** 2).sum())
@@ -138,7 +140,7 @@ class Stepper:
         shared, coupled = SCHEMES[self.flow.scheme]
         place = (u, self.normal, self.band.forward, self.band.backward, self.spacing)
         if self.metric:
-            return coupled(*place, beta, self.flux, self.work, self.tensor, self.outer, self.largest)
+            return coupled(*place, beta, self.tangents, self.flux, self.work, self.tensor, self.outer, self.largest)
         return shared(*place, self.flow.law, beta, self.flux, self.work, self.outer), 1.0
 
 

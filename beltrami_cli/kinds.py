@@ -85,7 +85,7 @@ class Kind:
             return np.nan
         if not self.is_circular:
             return float(np.sqrt(np.mean(d**2)))
-        return float(self.unit * np.sqrt(-2 * np.log(max(np.mean(np.cos(d / self.unit)), 1e-12))))
+        return float(self.unit * np.sqrt(-2 * np.log(max(float(np.mean(np.cos(d / self.unit))), 1e-12))))
 
     def errors(self, u: np.ndarray, data: np.ndarray) -> np.ndarray:
         """(...) squared error of channels u against data (K, ...): |u - data|^2, in data units.

@@ -176,11 +176,16 @@ def _check_grids(job: Job) -> Grid:
         raise RefusedError("spacing: is for .npy inputs only; found none among LEVELSET and DATA; drop --spacing")
     several = job.settings.kind == "vector"
     grids: dict[str, tuple[Path, Grid]] = {}
-    for name, path in zip(("LEVELSET", "DATA", "weights", "mask"), (job.levelset, job.data, job.weights, job.mask), strict=True):
+    for name, path in zip(
+        ("LEVELSET", "DATA", "weights", "mask"), (job.levelset, job.data, job.weights, job.mask), strict=True
+    ):
         if path is not None:
             is_data = name == "DATA"
             found = formats.read_grid(
-                path, spacing=_spacing_for(path, job.spacing), channels=is_data and several, plane=is_data and _is_plane(job)
+                path,
+                spacing=_spacing_for(path, job.spacing),
+                channels=is_data and several,
+                plane=is_data and _is_plane(job),
             )
             grids[name] = path, found
     first, (where, grid) = next(iter(grids.items()))

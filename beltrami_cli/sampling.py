@@ -10,7 +10,9 @@ from beltrami_cli.kernels.sheets import entries_at_vertices
 from beltrami_cli.surface import Mesh
 
 
-def surface_mesh(band: Band, values: np.ndarray | None = None, *, turns: bool = False) -> tuple[Mesh, np.ndarray | None]:
+def surface_mesh(
+    band: Band, values: np.ndarray | None = None, *, turns: bool = False
+) -> tuple[Mesh, np.ndarray | None]:
     """The band's surface in world space, facing outwards (increasing Psi), and `values` (K, E) at its vertices, (K, V).
 
     Vertices get the local cubic of the entries around them, the trilinear mean where its stencil is incomplete, NaN

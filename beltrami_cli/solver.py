@@ -32,6 +32,7 @@ from beltrami_cli.tuning import LEAST_VOXELS, Choice, Family, choose, decorrelat
 EPS_SHARE = 0.1
 # Parts of the surface without data are worth a warning above this share of the band: below it are lone voxels.
 LONE_SHARE = 1e-3
+CORRELATED = "the noise of neighbouring voxels looks correlated (interpolated, or painted from a mesh)"
 # Weights below 0 by no more than this share of the largest are rounding and interpolation.
 NEGATIVE_SHARE = 1e-3
 
@@ -119,7 +120,9 @@ class Solver:
                 record.update(result.record)
             yield result
         if empty:
-            self.warnings.add(f"{len(empty)} of {count} frames have no valid data on the surface: {empty[:10]}; left missing")
+            self.warnings.add(
+                f"{len(empty)} of {count} frames have no valid data on the surface: {empty[:10]}; left missing"
+            )
         record["Frames"] = {"count": count, "chosen_on": middle, "without_data": empty, "noise_sd": noise}
 
     def _sample(self, data: np.ndarray, warnings: Warnings) -> Sample:
@@ -130,7 +133,8 @@ class Solver:
         if doubt:
             warnings.add(doubt)
         with self.phases("extend"):
-            own = own_samples(self.band, kind.to_channels(self.band.gather(self.plane.forth(data))))
+            channels = kind.to_channels(self.band.gather(self.plane.forth(data)))
+            own = own_samples(self.band, channels, every=self.settings.extension == "none")
             trust = np.where(np.isnan(own[0]), 0, self.trust).astype(own.dtype)
             own[:, trust == 0] = np.nan
             course = replace(self.course, kind=kind)
@@ -188,12 +192,14 @@ class Solver:
             return True
         if beta is not None or stop is not None or not self.iterations:
             return False
-        enough = (sample.trust > 0).sum() >= LEAST_VOXELS
-        if not enough and self.settings.flow == "auto":
-            raise DataError(f"flow auto: found fewer than {LEAST_VOXELS} valid voxels to hold some out; name the flow")
-        if not enough:
-            self.warnings.add(f"beta auto: fewer than {LEAST_VOXELS} valid voxels, too few to hold some out: 1 / slope")
-        return bool(enough)
+        why = None
+        if (sample.trust > 0).sum() < LEAST_VOXELS:
+            why = f"there are fewer than {LEAST_VOXELS} valid voxels, too few to hold some out"
+        elif self.settings.flow != "auto" and looks_correlated(self.band, sample.own, sample.course.kind):
+            why = f"{CORRELATED}, so that held-out ones would be predicted from their own copies"
+        if why:
+            self.warnings.add(f"beta auto: {why}: beta is 1 / the data's median slope; give --beta or --edge")
+        return why is None
 
     def _families(self, beta: float | None, slope: float) -> list[Family]:
         """The flows to try: the one that was named, or all."""
@@ -209,11 +215,11 @@ class Solver:
 
     def _doubt(self, choice: Choice, sample: Sample) -> None:
         """Warn where held-out data are a poor judge."""
-        way_out = "check the result, or use --stop discrepancy with --noise-sigma"
+        way_out = "look at the result, or use --stop discrepancy with --noise-sigma S"
         if looks_correlated(self.band, sample.own, sample.course.kind):
             self.warnings.add(
-                "the noise of neighbouring voxels looks correlated (interpolated, or painted from a mesh): held-out "
-                f"voxels are then predicted from their own copies, and the automatic choice smooths too little; {way_out}"
+                f"automatic choice: {CORRELATED}: held-out ones are predicted from their own copies, and too little is "
+                f"smoothed; {way_out}"
             )
         elif not choice.is_clear:
             self.warnings.add(
@@ -230,6 +236,8 @@ class Solver:
             sigma = settings.noise_sigma or float(np.sqrt(np.mean(plan.noise**2)))
             if not sigma > 0:
                 raise DataError("stop discrepancy: the noise cannot be estimated from these data; give --noise-sigma S")
+            if settings.noise_sigma is None and looks_correlated(band, sample.own, course.kind):
+                self.warnings.add(f"stop discrepancy: {CORRELATED}, which hides its size; give it as --noise-sigma S")
             stop = discrepancy(course, sample.own, sample.trust, sigma)
         with self.phases("flow"):
             evolution, substeps = course.run(start, plan.flow, plan.schedule, observer, stop)
@@ -238,30 +246,31 @@ class Solver:
                 far = distance_along(band, start.known, settings.fill) > settings.fill
                 values[:, far & ~start.known] = np.nan
         if stop is not None and not evolution.iterations:
-            self.warnings.add("stop discrepancy: the data differ from their own mean over depth by more than the noise: no flow")
+            self.warnings.add("stop discrepancy: the start values are as far from the data as the noise: nothing to do")
         with self.phases("mesh"):
             mesh = None
             if not settings.flat:
                 mesh, at_vertices = surface_mesh(band, values, turns=course.kind.is_circular)
                 assert at_vertices is not None
                 mesh = replace(mesh, values=course.kind.at_vertices(at_vertices))
-        outside: dict[str, np.ndarray | float] = {"nan": np.nan, "zero": 0.0, "keep": self.plane.forth(data)}
-        out = self.plane.back(band.scatter(course.kind.to_values(values), outside[settings.outside]))
+        out = self._volume(course.kind.to_values(values), data)
         filled = ~start.known & ~np.isnan(values[0])
-        smoothness = tuple(smoothness_mm(band, u, course.kind) for u in (sample.own, values))
-        ran = Ran(
-            course.kind, sample.own, sample.trust, start, evolution, substeps, values, excess, smoothness
-        )  # fmt: skip
+        smoothness = smoothness_mm(band, sample.own, course.kind), smoothness_mm(band, values, course.kind)
+        ran = Ran(course.kind, sample.own, sample.trust, start, evolution, substeps, values, excess, smoothness)
         return Result(
             out, mesh, self.plane.back(band.scatter(filled, 0.0)),
             what_happened(settings, self.grid, band, plan, ran), tuple(self.warnings.lines),
         )  # fmt: skip
 
+    def _volume(self, values: np.ndarray, data: np.ndarray) -> np.ndarray:
+        """The band's values (E, ...) as a volume in the shape of the data."""
+        outside: dict[str, np.ndarray | float] = {"nan": np.nan, "zero": 0.0, "keep": self.plane.forth(data)}
+        return self.plane.back(self.band.scatter(values, outside[self.settings.outside]))
+
     def _nothing(self, data: np.ndarray) -> Result:
         """The result for a frame without data: everything missing."""
         band = self.band
-        outside = {"nan": np.nan, "zero": 0.0, "keep": self.plane.forth(data)}[self.settings.outside]
-        out = self.plane.back(band.scatter(np.full(band.entries, np.nan, data.dtype), outside))
+        out = self._volume(np.full(band.entries, np.nan, data.dtype), data)
         mesh = None
         if not self.settings.flat:
             mesh = surface_mesh(band)[0]
@@ -312,7 +321,9 @@ def _trust(
         trust = np.where(np.isfinite(weights), weights, 0).astype(settings.precision)
         low, high = float(trust.min()), float(trust.max())
         if low < -NEGATIVE_SHARE * max(high, 0.0):
-            raise RefusedError(f"weights: found values down to {low:g}; expected 0 or more (R^2, coherence, 1/variance)")
+            raise RefusedError(
+                f"weights: found values down to {low:g}; expected 0 or more (R^2, coherence, 1/variance)"
+            )
         if high <= 0:
             raise DataError("weights: found 0 everywhere; expected some data that count")
         if low < 0:

@@ -1,6 +1,6 @@
 """Connectome Workbench's best geodesic Gaussian, over ways to sample and widths, on the noisy cortex; --tool: ours too.
 
-python benchmarks/rivals.py [--tool] [CASE ...]; needs wb_command and the real volumes of ../shared/data.
+python benchmarks/rivals.py [--tool] [--seed N] [CASE ...]; needs wb_command and the real volumes of ../shared/data.
 """
 
 from __future__ import annotations
@@ -46,13 +46,14 @@ class Found:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tool", action="store_true", help="run beltrami denoise on each case as well")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise and holes of the cases made here")
     parser.add_argument("case", nargs="*", help="names of cases (default: all)")
     given = parser.parse_args()
     if not DATA.is_dir():
         sys.exit(f"the real volumes are not here: expected the folder {DATA}")
     if shutil.which("wb_command") is None:
         sys.exit("wb_command is not on the PATH: install Connectome Workbench")
-    for case in [*angle_cases(), patch_case()]:
+    for case in [*angle_cases(given.seed), patch_case(given.seed)]:
         if not given.case or case.name in given.case:
             report(case, with_tool=given.tool)
 

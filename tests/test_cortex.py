@@ -50,7 +50,7 @@ def away_from_border(vertices, triangles, ijk, shape):
 
 
 def at_points(band: Band, u: np.ndarray, ijk: np.ndarray) -> np.ndarray:
-    """(N,) u (1, E) at points of the surface in voxels of the whole grid: local cubic on the sheet of the nearest vertex.
+    """(N,) u (1, E) at points of the surface in voxels of the whole grid: local cubic on the nearest vertex's sheet.
 
     Starts from that vertex's own nearest entry; trilinear where the cubic's stencil is incomplete.
     """

@@ -100,7 +100,9 @@ def relax(u, free, forward, backward, spacing, tolerance, iterations):
                 for c in range(channels):
                     bend = 0.0
                     for a in range(3):
-                        bend += w[a] * (2 * direction[c, m] - direction[c, forward[a, m]] - direction[c, backward[a, m]])
+                        bend += w[a] * (
+                            2 * direction[c, m] - direction[c, forward[a, m]] - direction[c, backward[a, m]]
+                        )
                     image[c, m] = bend
                     share += bend * direction[c, m]
             part[block] = share

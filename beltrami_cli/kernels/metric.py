@@ -1,12 +1,15 @@
 """Fluxes of the Beltrami flow of several channels, coupled by the metric of the surface that they span together.
 
-With V = [v_1 ... v_K] the channels' tangential gradients, M = I_K + beta^2 V^T V is the metric in Gram form; flux_k =
-sum_l C_kl v_l with C = sqrt(det M) M^-1, and the outer factor is a = 1 / sqrt(det M). For one channel C = a = r. M enters
-through the 3 x 3 matrix A = I_3 + beta^2 V V^T: det M = det A and M^-1 = I_K - beta^2 V^T A^-1 V, so K may be large.
+With V = [v_1 ... v_K] the channels' tangential gradients and M = I_K + beta^2 V^T V their metric in Gram form, channel k
+has the flux sum_l C_kl v_l, C = sqrt(det M) M^-1, and the outer factor a = 1 / sqrt(det M). As V M^-1 = A^-1 V with the
+3 x 3 matrix A = I + beta^2 V V^T, of the same determinant, that is T v_k with one tensor T = sqrt(det A) P A^-1 P for all
+channels: none can push another out of its range. Of S = beta^2 V V^T: det A = 1 + tr S + tr adj S + det S, and
+adj A = (1 + tr S) I - S + adj S.
 
-Arrays as in `steps`; tensor: (K, K, E) C; outer: (E,) a. An eigenvalue of C can exceed 1, up to sqrt(det M), and with it
-what a step may be: each scheme returns the sum over entries of sum_kl C_kl v_k^T v_l / 2 and the largest
-a_i (lambda_max(C_i) + lambda_max(C_j)) / 2 over the faces i|j, by which dt is to be divided.
+Arrays as in `steps`; tensor: (6, E) T as 00, 11, 22, 01, 02, 12; outer: (E,) a; largest: (E,) its largest eigenvalue,
+which can exceed 1, and with it what a step may be; tangents: dimensions of the tangent space, 1 for a curve, 2 for a
+surface or a picture, 3 for a volume. A scheme returns the sum over entries of sum_k v_k^T T v_k / 2 and the largest
+max(a_i, a_j) (largest_i + largest_j) / 2 over the faces i|j, by which dt is to be divided.
 """
 
 import numba as nb
@@ -14,38 +17,59 @@ import numpy as np
 
 from beltrami_cli.kernels import BLOCK, total
 
+ROUNDING = 1e-13  # of differences between products of the entries of S, relative to powers of its trace
+
 
 @nb.njit(cache=True)
-def couple(v, b2, m, tensor, outer, largest):
-    """Write C, a and lambda_max(C) of entry m from its gradients v (K, 3) at beta^2 = b2."""
-    channels = len(v)
-    a00, a01, a02, a11, a12, a22 = 1.0, 0.0, 0.0, 1.0, 0.0, 1.0
-    for k in range(channels):
-        a00 += b2 * v[k, 0] * v[k, 0]
-        a01 += b2 * v[k, 0] * v[k, 1]
-        a02 += b2 * v[k, 0] * v[k, 2]
-        a11 += b2 * v[k, 1] * v[k, 1]
-        a12 += b2 * v[k, 1] * v[k, 2]
-        a22 += b2 * v[k, 2] * v[k, 2]
-    c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
-    c11, c12, c22 = a00 * a22 - a02 * a02, a01 * a02 - a00 * a12, a00 * a11 - a01 * a01
-    determinant = max(a00 * c00 + a01 * c01 + a02 * c02, 1.0)
-    size = np.sqrt(determinant)
-    share = b2 / determinant
-    for k in range(channels):
-        x = share * (c00 * v[k, 0] + c01 * v[k, 1] + c02 * v[k, 2])
-        y = share * (c01 * v[k, 0] + c11 * v[k, 1] + c12 * v[k, 2])
-        z = share * (c02 * v[k, 0] + c12 * v[k, 1] + c22 * v[k, 2])
-        for j in range(k + 1):
-            inner = x * v[j, 0] + y * v[j, 1] + z * v[j, 2]
-            tensor[k, j, m] = tensor[j, k, m] = size * ((1.0 if j == k else 0.0) - inner)
+def couple(v, b2, normal, m, tangents, tensor, outer, largest):
+    """Write T, a and T's largest eigenvalue at entry m from its gradients v (K, 3) at beta^2 = b2."""
+    s00, s11, s22, s01, s02, s12 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(len(v)):
+        s00 += b2 * v[k, 0] * v[k, 0]
+        s11 += b2 * v[k, 1] * v[k, 1]
+        s22 += b2 * v[k, 2] * v[k, 2]
+        s01 += b2 * v[k, 0] * v[k, 1]
+        s02 += b2 * v[k, 0] * v[k, 2]
+        s12 += b2 * v[k, 1] * v[k, 2]
+    trace = s00 + s11 + s22
+    a00, a11, a22 = s11 * s22 - s12 * s12, s00 * s22 - s02 * s02, s00 * s11 - s01 * s01
+    a01, a02, a12 = s02 * s12 - s01 * s22, s01 * s12 - s02 * s11, s01 * s02 - s00 * s12
+    second, third = a00 + a11 + a22, s00 * a00 + s01 * a01 + s02 * a02
+    second = second if second > ROUNDING * trace**2 else 0.0
+    third = third if third > ROUNDING * trace**3 else 0.0
+    size = np.sqrt(1 + trace + second + third)
+    n0, n1, n2 = float(normal[0, m]), float(normal[1, m]), float(normal[2, m])
+    # On a surface adj S lies along the normal, which P removes; without one P = I.
+    rest = 0.0 if n0 * n0 + n1 * n1 + n2 * n2 > 0 else 1.0
+    tensor[0, m] = ((1 + trace) * (1 - n0 * n0) - s00 + rest * a00) / size
+    tensor[1, m] = ((1 + trace) * (1 - n1 * n1) - s11 + rest * a11) / size
+    tensor[2, m] = ((1 + trace) * (1 - n2 * n2) - s22 + rest * a22) / size
+    tensor[3, m] = (-(1 + trace) * n0 * n1 - s01 + rest * a01) / size
+    tensor[4, m] = (-(1 + trace) * n0 * n2 - s02 + rest * a02) / size
+    tensor[5, m] = (-(1 + trace) * n1 * n2 - s12 + rest * a12) / size
     outer[m] = 1 / size
-    largest[m] = size if channels > 1 else 1 / size
+    if tangents == 1:
+        largest[m] = 1 / size
+    elif tangents == 2:
+        largest[m] = (1 + (trace + np.sqrt(max(trace**2 - 4 * second, 0.0))) / 2) / size
+    else:
+        largest[m] = (1 + trace + second) / size
+
+
+@nb.njit(cache=True, inline="always")
+def dot(tensor, m, x):
+    """T x at entry m."""
+    t01, t02, t12 = tensor[3, m], tensor[4, m], tensor[5, m]
+    return (
+        tensor[0, m] * x[0] + t01 * x[1] + t02 * x[2],
+        t01 * x[0] + tensor[1, m] * x[1] + t12 * x[2],
+        t02 * x[0] + t12 * x[1] + tensor[2, m] * x[2],
+    )
 
 
 @nb.njit(cache=True, parallel=True)
-def symmetric(u, normal, forward, backward, spacing, beta, flux, work, tensor, outer, largest):
-    """The symmetric scheme of `steps.symmetric` with C in place of c; its arguments, and (energy, bound)."""
+def symmetric(u, normal, forward, backward, spacing, beta, tangents, flux, work, tensor, outer, largest):
+    """The symmetric scheme of `steps.symmetric` with T in place of c P; its arguments, and (energy, bound)."""
     channels, entries = u.shape
     blocks = (entries + BLOCK - 1) // BLOCK
     energies, bounds = np.zeros(blocks), np.zeros(blocks)
@@ -53,7 +77,7 @@ def symmetric(u, normal, forward, backward, spacing, beta, flux, work, tensor, o
     inverse = 1 / spacing.astype(np.float64)
     for block in nb.prange(blocks):
         ahead, behind = np.empty((channels, 3)), np.empty((channels, 3))
-        v, cross, mixed = np.empty((channels, 3)), np.empty((channels, 3)), np.empty((channels, 3))
+        g, v = np.empty((channels, 3)), np.empty((channels, 3))
         energy = 0.0
         for m in range(block * BLOCK, min(entries, (block + 1) * BLOCK)):
             for k in range(channels):
@@ -61,23 +85,17 @@ def symmetric(u, normal, forward, backward, spacing, beta, flux, work, tensor, o
                 for a in range(3):
                     ahead[k, a] = (u[k, forward[a, m]] - u[k, m]) * inverse[a]
                     behind[k, a] = (u[k, m] - u[k, backward[a, m]]) * inverse[a]
-                    v[k, a] = 0.5 * (ahead[k, a] + behind[k, a])
-                    along += normal[a, m] * v[k, a]
+                    g[k, a] = 0.5 * (ahead[k, a] + behind[k, a])
+                    along += normal[a, m] * g[k, a]
                 for a in range(3):
-                    central = v[k, a]
-                    v[k, a] = central - along * normal[a, m]
-                    cross[k, a] = v[k, a] - (1 - normal[a, m] ** 2) * central
-            couple(v, b2, m, tensor, outer, largest)
+                    v[k, a] = g[k, a] - along * normal[a, m]
+            couple(v, b2, normal, m, tangents, tensor, outer, largest)
             for k in range(channels):
+                whole = dot(tensor, m, g[k])
                 for a in range(3):
-                    mixed[k, a] = 0.0
-                    for j in range(channels):
-                        mixed[k, a] += tensor[k, j, m] * cross[j, a]
-                    work[k, a, m] = 0.5 * mixed[k, a] * inverse[a]
-                    for j in range(channels):
-                        square = 0.5 * (ahead[k, a] * ahead[j, a] + behind[k, a] * behind[j, a])
-                        energy += tensor[k, j, m] * (1 - normal[a, m] ** 2) * square
-                    energy += 0.5 * mixed[k, a] * (ahead[k, a] + behind[k, a])
+                    cross = whole[a] - tensor[a, m] * g[k, a]
+                    work[k, a, m] = 0.5 * cross * inverse[a]
+                    energy += 0.5 * tensor[a, m] * (ahead[k, a] ** 2 + behind[k, a] ** 2) + cross * g[k, a]
         energies[block] = energy
     for block in nb.prange(blocks):
         bound = 0.0
@@ -89,19 +107,16 @@ def symmetric(u, normal, forward, backward, spacing, beta, flux, work, tensor, o
                         flux[k, a, m] = 0
                     continue
                 bound = max(bound, max(outer[m], outer[e]) * (largest[m] + largest[e]) / 2)
-                here, there = 1 - normal[a, m] ** 2, 1 - normal[a, e] ** 2
+                across = 0.5 * (tensor[a, m] + tensor[a, e]) * inverse[a] ** 2
                 for k in range(channels):
-                    s = 0.0
-                    for j in range(channels):
-                        s += (tensor[k, j, m] * here + tensor[k, j, e] * there) * (u[j, e] - u[j, m])
-                    flux[k, a, m] = 0.5 * s * inverse[a] ** 2 + work[k, a, m] + work[k, a, e]
+                    flux[k, a, m] = across * (u[k, e] - u[k, m]) + work[k, a, m] + work[k, a, e]
         bounds[block] = bound
     return 0.5 * total(energies), bounds.max()
 
 
 @nb.njit(cache=True, parallel=True)
-def paper(u, normal, forward, backward, spacing, beta, flux, work, tensor, outer, largest):
-    """The scheme of `steps.paper` with C in place of c; arguments and result as for `symmetric`."""
+def paper(u, normal, forward, backward, spacing, beta, tangents, flux, work, tensor, outer, largest):
+    """The scheme of `steps.paper` with T in place of c P; arguments and result as for `symmetric`."""
     channels, entries = u.shape
     blocks = (entries + BLOCK - 1) // BLOCK
     energies, bounds = np.zeros(blocks), np.zeros(blocks)
@@ -118,14 +133,12 @@ def paper(u, normal, forward, backward, spacing, beta, flux, work, tensor, outer
                     along += normal[a, m] * v[k, a]
                 for a in range(3):
                     v[k, a] -= along * normal[a, m]
-            couple(v, b2, m, tensor, outer, largest)
+            couple(v, b2, normal, m, tangents, tensor, outer, largest)
             for k in range(channels):
+                whole = dot(tensor, m, v[k])
                 for a in range(3):
-                    s = 0.0
-                    for j in range(channels):
-                        s += tensor[k, j, m] * v[j, a]
-                    energy += s * v[k, a]
-                    flux[k, a, m] = s * inverse[a] if forward[a, m] != m else 0
+                    energy += whole[a] * v[k, a]
+                    flux[k, a, m] = whole[a] * inverse[a] if forward[a, m] != m else 0
         energies[block] = energy
     for block in nb.prange(blocks):
         bound = 0.0
