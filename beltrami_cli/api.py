@@ -32,7 +32,7 @@ def denoise(
 
     levelset: Psi, (nx, ny, nz), or (nx, ny) for a curve in a plane; negative inside; None with flat=True.
     data: values of the same shape, NaN where missing; with kind="vector" complex, or of shape (..., K).
-    weights: confidence of the data, of Psi's shape, 0 or more (R^2, coherence); mask: likewise, which data count (not 0).
+    weights: confidence of the data, of Psi's shape, 0 or more (R^2, coherence). mask: alike, which data count (not 0).
     affine: (4, 4), voxel indices to RAS mm; or spacing: mm, one number or one per axis (default 1).
     observer: called after every iteration with (iteration, iterations, root mean square change).
     options: the fields of `config.Settings`, such as flow="beltrami", beta=0.05, iterations=20.
@@ -86,9 +86,10 @@ def _frames(solver: Solver, data: np.ndarray) -> Result:
     """Every frame of data (nx, ny, nz, K) on its own."""
     record: dict[str, Any] = {}
     results = list(solver.denoise_frames(data.shape[3], lambda t: data[..., t], record))
-    mesh = results[0].mesh
-    if mesh is not None:
-        mesh = replace(mesh, values=np.stack([r.mesh.values for r in results if r.mesh is not None], -1))
+    meshes = [result.mesh for result in results if result.mesh is not None]
+    mesh = None
+    if meshes:
+        mesh = replace(meshes[0], values=np.stack([m.values for m in meshes if m.values is not None], -1))
     filled = np.logical_or.reduce([r.filled for r in results])
     return Result(np.stack([r.data for r in results], -1), mesh, filled, record, ())
 

@@ -63,12 +63,12 @@ class Band:
         return a, b, c
 
     def gather(self, volume: np.ndarray) -> np.ndarray:
-        """Values (E, ...) of a volume (nx, ny, nz, ...) on the whole grid at every entry's voxel, shared by its sheets."""
+        """Values (E, ...) of a volume (nx, ny, nz, ...) at every entry's voxel, shared by its sheets."""
         box = np.ascontiguousarray(volume[self.box])
         return box.reshape(-1, *box.shape[3:])[self.voxel]
 
     def scatter(self, values: np.ndarray, outside: np.ndarray | float) -> np.ndarray:
-        """A volume (nx, ny, nz, ...) on the whole grid: primary entries' values (E, ...) in the band, else `outside`."""
+        """A volume (nx, ny, nz, ...): primary entries' values (E, ...) in the band, `outside` elsewhere."""
         out = np.empty(self.grid.shape + values.shape[1:], values.dtype)
         out[...] = outside
         box = np.ascontiguousarray(out[self.box])

@@ -59,8 +59,8 @@ def extend(
     method: "closest-point" (each entry takes the value of valid voxels at its closest surface point, see
     `at_closest_points`), "pde" (U_t + sign(Psi) grad U . grad Psi = 0, Sec. 2.1) or "none" (each voxel keeps its own
     value; sheets other than the nearest take the closest point's). Holes are then filled from the band around them.
-    depth: (A, B) in mm along the normal, for "closest-point": data are averaged from A to B. turns: the channels are cos
-    and sin of an angle, on which nothing may depend on where the angle is 0.
+    depth: (A, B) in mm along the normal, for "closest-point": data are averaged from A to B.
+    turns: the channels are cos and sin of an angle; nothing may depend on where that is 0.
     Raises DataError where no entry is reached by valid data.
     """
     own = np.where(confidence > 0, own, np.nan)

@@ -28,16 +28,27 @@ def compare_volumes(
 ) -> Difference:
     """B minus the reference A on one grid, near the surface of `levelset` where it is given (within mm of it).
 
+    Several channels or frames are compared value by value, complex numbers as their real and imaginary part.
     Raises RefusedError where the grids differ, DataError where nothing can be compared.
     """
-    first, second = formats.read_volume(a, dtype=np.float64), formats.read_volume(b, dtype=np.float64)
+    psi = None if levelset is None else formats.read_volume(levelset)
+    flat = psi is not None and 1 in psi.grid.shape
+    first, second = (formats.read_volume(path, dtype=np.float64, channels=True, plane=flat) for path in (a, b))
     require_same_grid(first.grid, f"A {a}", second.grid, f"B {b}", remedy=REMEDY)
     mask = None
-    if levelset is not None:
-        psi = formats.read_volume(levelset)
+    if psi is not None:
         require_same_grid(first.grid, f"A {a}", psi.grid, f"PSI {levelset}", remedy=REMEDY)
         mask = _near_surface(psi, f"PSI {levelset}", within)
-    return difference(first.data, second.data, mask=mask, period=period, data_range=data_range)
+    x, y = _parts(first), _parts(second)
+    if mask is not None and x.ndim == 4:
+        mask = np.broadcast_to(mask[..., None], x.shape)
+    return difference(x, y, mask=mask, period=period, data_range=data_range)
+
+
+def _parts(volume: Volume) -> np.ndarray:
+    """The values, complex ones as two channels."""
+    data = volume.data
+    return np.stack([data.real, data.imag], -1) if np.iscomplexobj(data) else data
 
 
 def _near_surface(psi: Volume, name: str, within: float | None) -> np.ndarray:
@@ -55,20 +66,30 @@ def _near_surface(psi: Volume, name: str, within: float | None) -> np.ndarray:
 
 
 def describe_volume(path: Path) -> list[str]:
-    """Lines on format, grid, orientation, values and surface of a volume; raises as `formats.read_volume`."""
-    volume = formats.read_volume(path)
+    """Lines on format, grid, orientation, values and surface of a volume; raises as `formats.read_volume`.
+
+    Only a volume of one real value per voxel is looked at as a level set.
+    """
+    volume = formats.read_volume(path, channels=True)
     grid, values = volume.grid, volume.data
     finite = values[np.isfinite(values)]
-    shape = " x ".join(map(str, volume.file_shape))
+    shape = " x ".join(map(str, grid.shape if volume.channels > 1 else volume.file_shape))
     lines = [
         f"{formats.volume_format(path)}, {shape} voxels of {' x '.join(f'{h:.4g}' for h in grid.spacing)} mm, "
         f"axes towards {_orientation(grid.affine)}{', sheared' if grid.is_sheared() else ''}",
         f"first voxel at RAS {', '.join(f'{x:.4g}' for x in grid.affine[:3, 3])} mm",
         f"values: {finite.size} finite, {int(np.isnan(values).sum())} NaN, {int(np.isinf(values).sum())} infinite",
     ]
+    if volume.channels > 1:
+        lines.append(f"{volume.channels} channels or frames: for denoise --kind vector")
+    if np.iscomplexobj(values):
+        lines.append("complex numbers, real and imaginary part: for denoise --kind vector")
+        finite = np.abs(finite)
     if finite.size:
         low, middle, high = finite.min(), np.median(finite), finite.max()
-        lines.append(f"range: {low:.6g} to {high:.6g}, median {middle:.6g}")
+        what = "magnitude" if np.iscomplexobj(values) else "range"
+        lines.append(f"{what}: {low:.6g} to {high:.6g}, median {middle:.6g}")
+    if finite.size and volume.channels == 1 and not np.iscomplexobj(values):
         lines.append(f"as a level set: {_as_levelset(values, finite)}")
     return lines
 

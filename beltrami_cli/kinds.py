@@ -79,7 +79,7 @@ class Kind:
         return turned[None] * self.unit
 
     def spread(self, a: np.ndarray, b: np.ndarray) -> float:
-        """Root mean square of the differences of channels a and b (K, N); for angles sqrt(-2 ln mean cos), in data units."""
+        """Root mean square of a - b, channels (K, N), in data units; for angles sqrt(-2 ln mean cos)."""
         d = self.differences(a, b)
         if not d.size:
             return np.nan
@@ -90,8 +90,8 @@ class Kind:
     def errors(self, u: np.ndarray, data: np.ndarray) -> np.ndarray:
         """(...) squared error of channels u against data (K, ...): |u - data|^2, in data units.
 
-        For angles P^2 / (2 pi^2) (1 - cos of the difference), which is its square where it is small. Either way its mean
-        over independent noise of zero mean is lowest where u is what lies below the noise.
+        For angles P^2 / (2 pi^2) (1 - cos of the difference), which is its square where it is small. Either way its
+        mean over independent noise of zero mean is lowest where u is what lies below the noise.
         """
         x, y = u.astype(float), data.astype(float)
         if not self.is_circular:

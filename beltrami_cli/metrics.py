@@ -12,9 +12,9 @@ from beltrami_cli.errors import DataError, RefusedError
 
 @dataclass(frozen=True)
 class Difference:
-    """B minus A over the voxels where both have a finite value, in data units.
+    """B minus A over the values that are finite in both, in data units; of several channels each is a value.
 
-    compared: voxels where both are finite. only_in_a, only_in_b: voxels where only the one is.
+    compared: values that are finite in both. only_in_a, only_in_b: those that are in only one.
     data_range: what psnr counts as the full scale. psnr: 20 log10(data_range / rms) in dB, inf where A equals B.
     correlation: Pearson's, or the circular coefficient for angles; NaN where A or B is constant.
     """
@@ -76,7 +76,7 @@ def difference(
     both = in_a & in_b
     if not both.any():
         raise DataError(
-            f"nothing to compare: of {looked_at.sum()} voxels looked at, {in_a.sum()} have a value in A and "
+            f"nothing to compare: of {looked_at.sum()} places looked at, {in_a.sum()} have a value in A and "
             f"{in_b.sum()} in B, none in both"
         )
     x, y = a[both].astype(float), b[both].astype(float)

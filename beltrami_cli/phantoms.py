@@ -26,7 +26,8 @@ SIZES = (16, 512)
 class Phantom:
     """A surface and the data on it, on one grid.
 
-    levelset, clean, noisy: float32 arrays of one shape: (size, size, size), or (size, size) for the curve.
+    levelset, clean, noisy: float32 arrays of one shape: (size, size, size), or (size, size) for the curve; colours have
+        three channels on a further axis of clean and noisy.
     grid: voxels of 1 mm; its shape has a third axis of length 1 for the curve.
     """
 
@@ -38,7 +39,10 @@ class Phantom:
     def volumes(self) -> dict[str, Volume]:
         """`levelset`, `clean` and `noisy` as volumes that remember the arrays' own shape."""
         arrays = {"levelset": self.levelset, "clean": self.clean, "noisy": self.noisy}
-        return {name: Volume(a.reshape(self.grid.shape), self.grid, a.shape) for name, a in arrays.items()}
+        channels = {name: a.shape[self.levelset.ndim :] for name, a in arrays.items()}
+        return {
+            name: Volume(a.reshape(self.grid.shape + channels[name]), self.grid, a.shape) for name, a in arrays.items()
+        }
 
 
 def torus(size: int = 64, *, noise: float = 40.0, seed: int = 0, map: str = "mixed") -> Phantom:
@@ -95,11 +99,14 @@ def curve(size: int = 128, *, noise: float = 15.0, seed: int = 0) -> Phantom:
     return _phantom(np.where(inside, -distance, distance), 128 + 45 * np.sin(2 * t) + jumps, noise, seed)
 
 
-def portrait(size: int = 64, *, noise: float = 40.0, seed: int = 0) -> Phantom:
-    """A grey portrait (Eileen Collins, by NASA, in the public domain) on an ellipsoid; size 140 has 2,744,000 voxels.
+def portrait(size: int = 64, *, noise: float = 40.0, seed: int = 0, map: str = "grey") -> Phantom:
+    """A portrait (Eileen Collins, by NASA, in the public domain) on an ellipsoid; size 140 has 2,744,000 voxels.
 
     The picture, 0 to 255, is projected along the second axis onto the front, its mirror image onto the back.
+    map: `grey`, or `rgb` for three channels.
     """
+    if map not in ("grey", "rgb"):
+        raise RefusedError(f"map of the portrait: found {map!r}, expected grey or rgb")
     from scipy.ndimage import map_coordinates
     from skimage import data
     from skimage.color import rgb2gray
@@ -111,13 +118,15 @@ def portrait(size: int = 64, *, noise: float = 40.0, seed: int = 0) -> Phantom:
     outside = np.tensordot(1 / axes**2, x**2, 1) > 1
     distance = np.sqrt(((x - nearest) ** 2).sum(0))
 
-    head = rgb2gray(data.astronaut())[0:256, 104:324]
+    head = data.astronaut()[0:256, 104:324]
+    channels = np.moveaxis(head / 255, -1, 0) if map == "rgb" else rgb2gray(head)[None]
     # One pixel per voxel where the surface faces the viewer: finer detail would only alias.
     rows, columns = (2 * round(float(a)) for a in axes[[2, 0]])
-    picture = 255 * resize(head, (rows, columns), anti_aliasing=True)
     row = (1 - nearest[2] / axes[2]) / 2 * (rows - 1)
     column = (1 - nearest[0] / axes[0]) / 2 * (columns - 1)  # seen from the front, +x (right) is on the left
-    clean = map_coordinates(picture, [row, column], order=1, mode="nearest")
+    pictures = [255 * resize(channel, (rows, columns), anti_aliasing=True) for channel in channels]
+    painted = [map_coordinates(picture, [row, column], order=1, mode="nearest") for picture in pictures]
+    clean = np.stack(painted, -1) if map == "rgb" else painted[0]
     return _phantom(np.where(outside, distance, -distance), clean, noise, seed)
 
 
@@ -181,7 +190,7 @@ def _phantom(psi: np.ndarray, clean: np.ndarray, noise: float, seed: int) -> Pha
         raise RefusedError(f"seed of the phantom: found {seed}, expected a whole number of at least 0")
     noisy = clean + noise * np.random.default_rng(seed).standard_normal(clean.shape)
     single = np.float32
-    return Phantom(psi.astype(single), clean.astype(single), noisy.astype(single), Grid.from_spacing(clean.shape))
+    return Phantom(psi.astype(single), clean.astype(single), noisy.astype(single), Grid.from_spacing(psi.shape))
 
 
 def _trefoil(t: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

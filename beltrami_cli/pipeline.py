@@ -171,7 +171,7 @@ class _Files:
 
 
 def _check_grids(job: Job) -> Grid:
-    """The grid to compute on, from headers alone; raises RefusedError where it, or what it is to be written to, will not do."""
+    """The grid to compute on, from headers alone; raises RefusedError where it or the outputs' formats will not do."""
     if job.spacing is not None and not any(formats.volume_format(path) == "NPY" for path in job.all_inputs):
         raise RefusedError("spacing: is for .npy inputs only; found none among LEVELSET and DATA; drop --spacing")
     several = job.settings.kind == "vector"

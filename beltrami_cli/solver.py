@@ -186,7 +186,7 @@ class Solver:
         return 1 / eps if eps else 0.0
 
     def _chooses(self, beta: float | None, sample: Sample) -> bool:
-        """True where held-out data are to choose: they cannot without iterations, or beside a rule that needs no beta."""
+        """True where held-out data are to choose; another stopping rule, or too poor data, leave beta to the slope."""
         stop = self.settings.stop
         if stop == "auto":
             return True

@@ -13,9 +13,17 @@ class Mesh:
 
     vertices_ras_mm: (V, 3) float64 in RAS mm.
     cells: (C, 3) int32 triangles, counter-clockwise seen from outside; (C, 2) segments for a curve.
-    values: (V,) data values, NaN where missing; None for geometry alone.
+    values: (V,) data values, or (V, K) of K channels or frames, real, NaN where missing; None for geometry alone.
     """
 
     vertices_ras_mm: np.ndarray
     cells: np.ndarray
     values: np.ndarray | None = None
+
+    def named_values(self) -> dict[str, np.ndarray]:
+        """(V,) values by name: `value`, or `value 1`, `value 2` ... of several channels; empty for geometry alone."""
+        if self.values is None:
+            return {}
+        if self.values.ndim == 1:
+            return {"value": self.values}
+        return {f"value {k + 1}": self.values[:, k] for k in range(self.values.shape[1])}

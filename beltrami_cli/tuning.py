@@ -126,10 +126,11 @@ def choose(
     *,
     stop: bool,
 ) -> Choice:
-    """The run of least held-out error over `families`, their betas, and, with `stop`, the iterations up to `iterations`.
+    """The run of least held-out error over `families`, their betas and, with `stop`, iterations up to `iterations`.
 
     own: (K, E) samples of weights trust (E,). slope: typical slope of the data (data units per mm), where the search
-    over beta starts. Without `stop`, runs are compared at their last iteration. Raises DataError where too few voxels hold data.
+    over beta starts. Without `stop`, runs are compared at their last iteration.
+    Raises DataError where too few voxels hold data.
     """
     held = hold_out(course.band, trust, seed)
     rest, left = own.copy(), trust.copy()
@@ -159,7 +160,7 @@ def choose(
 
 
 class _Watch:
-    """Follows the error at the held-out entries (H,) and says when there is nothing more to see (never, with to_end)."""
+    """Follows the error at the held-out entries (H,) and says when nothing more is to be seen (never, with to_end)."""
 
     def __init__(
         self, kind: Kind, held: np.ndarray, truth: np.ndarray, weight: np.ndarray, rival: Curve | None, *, to_end: bool

@@ -44,40 +44,49 @@ def tangential(normal, d, u):
     return np.einsum("abm,bmi,ki->kam", projection(normal), d, u, optimize=True)
 
 
-# A coupling is a function of v (K, 3, E) and beta that gives C (K, K, E) and the outer factor a (E,).
+# A coupling is a function of v (K, 3, E), P (3, 3, E) and beta that gives T (3, 3, E), by which channel k has the flux
+# T v_k, and the outer factor a (E,).
 
 
 def shared(law):
-    """One diffusivity for all channels: C = c I at s = beta sqrt(sum_k |v_k|^2), a = c."""
+    """One diffusivity in all directions: T = c P at s = beta sqrt(sum_k |v_k|^2), a = c."""
 
-    def coupling(v, beta):
+    def coupling(v, p, beta):
         c = DIFFUSIVITY[law](beta * np.sqrt((v**2).sum((0, 1))))
-        return np.eye(len(v))[:, :, None] * c, c
+        return c * p, c
 
     return coupling
 
 
-def by_metric(v, beta):
-    """C = sqrt(det M) M^-1 and a = 1 / sqrt(det M), with M = I + beta^2 V^T V, V the matrix [v_1 ... v_K]."""
+def by_metric(v, p, beta):
+    """T = sqrt(det A) P A^-1 P and a = 1 / sqrt(det A), with A = I + beta^2 V V^T, V the matrix [v_1 ... v_K]."""
+    matrix = np.eye(3) + beta**2 * np.einsum("kam,kbm->mab", v, v)
+    size = np.sqrt(np.linalg.det(matrix))
+    inverse = np.moveaxis(np.linalg.inv(matrix), 0, -1)
+    return size * np.einsum("abm,bcm,cdm->adm", p, inverse, p), 1 / size
+
+
+def gram_fluxes(v, beta):
+    """(K, 3, E) sum_l C_kl v_l with C = sqrt(det M) M^-1, M = I + beta^2 V^T V."""
     m = np.eye(len(v)) + beta**2 * np.einsum("kam,lam->mkl", v, v)
-    size = np.sqrt(np.linalg.det(m))
-    return np.moveaxis(size[:, None, None] * np.linalg.inv(m), 0, -1), 1 / size
+    c = np.sqrt(np.linalg.det(m))[:, None, None] * np.linalg.inv(m)
+    return np.einsum("mkl,lam->kam", c, v)
 
 
 def symmetric(u, normal, forward, backward, spacing, coupling, outer, beta, dt):
-    """One step of u (K, E): minus the exact gradient of the mean of sum_kl C_kl v_k^T v_l / 2 over the 8 choices of g.
+    """One step of u (K, E): minus the exact gradient of the mean of sum_k g_k^T T g_k / 2 over the 8 choices of g.
 
-    C is taken at the central differences, and held fixed. Returns (u after the step, sum of squared changes, energy).
+    T is taken at the central differences, and held fixed. Returns (u after the step, sum of squared changes, energy).
     """
     d = difference_matrices(forward, backward, spacing)
-    c, a = coupling(tangential(normal, d.mean(0), u), beta)
+    t, a = coupling(tangential(normal, d.mean(0), u), projection(normal), beta)
     rate, energy = np.zeros(u.shape), 0.0
     for sides in product((0, 1), repeat=3):
         g = np.stack([d[side, a] for a, side in enumerate(sides)])
-        v = tangential(normal, g, u)
-        flux = np.einsum("klm,lam->kam", c, v)
+        slope = np.einsum("ami,ki->kam", g, u)
+        flux = np.einsum("abm,kbm->kam", t, slope)
         rate -= np.einsum("ami,kam->ki", g, flux) / 8
-        energy += (flux * v).sum() / 16
+        energy += (flux * slope).sum() / 16
     change = dt * (a if outer else 1) * rate
     return u + change, (change**2).sum(), energy
 
@@ -88,14 +97,12 @@ def symmetric_by_fluxes(u, normal, forward, backward, spacing, coupling, outer, 
     p = projection(normal)
     h = np.asarray(spacing)[:, None]
     g = (u[:, forward] - u[:, backward]) / (2 * h)  # a missing link adds 0 to either side
-    v = np.einsum("abm,kbm->kam", p, g)
-    c, outer_factor = coupling(v, beta)
+    t, outer_factor = coupling(np.einsum("abm,kbm->kam", p, g), p, beta)
     rate = np.zeros(u.shape)
     for a in range(3):
-        q = np.einsum("klm,lm->km", c, v[:, a] - p[a, a] * g[:, a])
+        q = sum(t[a, b] * g[:, b] for b in range(3) if b != a)
         f = forward[a]
-        along = c * p[a, a]
-        flux = np.einsum("klm,lm->km", along + along[:, :, f], u[:, f] - u) / 2 / h[a] + (q + q[:, f]) / 2
+        flux = (t[a, a] + t[a, a, f]) * (u[:, f] - u) / 2 / h[a] + (q + q[:, f]) / 2
         flux[:, f == own] = 0
         rate += flux / h[a] - np.where(backward[a] == own, 0, flux[:, backward[a]]) / h[a]
     return u + dt * (outer_factor if outer else 1) * rate
@@ -105,19 +112,31 @@ def paper(u, normal, forward, backward, spacing, coupling, outer, beta, dt):
     """Sec. 4.1 with |N| = 1: forward gradient and its adjoint, the backward divergence. Returns as `symmetric`."""
     d = difference_matrices(forward, backward, spacing)[0]
     v = tangential(normal, d, u)
-    c, a = coupling(v, beta)
-    flux = np.einsum("klm,lam->kam", c, v)
+    t, a = coupling(v, projection(normal), beta)
+    flux = np.einsum("abm,kbm->kam", t, v)
     change = -dt * (a if outer else 1) * np.einsum("ami,kam->ki", d, flux)
     return u + change, (change**2).sum(), (flux * v).sum() / 2
 
 
 def largest_over_faces(tensor, outer, forward):
-    """The most, over the faces i|j and both their sides, of a_i lambda_max(C_i + C_j) / 2."""
-    c, own = np.moveaxis(tensor, -1, 0), np.arange(len(outer))
+    """The most, over the faces i|j and both their sides, of a_i lambda_max(T_i + T_j) / 2."""
+    t, own = np.moveaxis(tensor, -1, 0), np.arange(len(outer))
     return max(
-        float((np.maximum(outer, outer[f]) * np.linalg.eigvalsh(c + c[f])[:, -1] / 2)[f != own].max(initial=0))
+        float((np.maximum(outer, outer[f]) * np.linalg.eigvalsh(t + t[f])[:, -1] / 2)[f != own].max(initial=0))
         for f in forward
     )
+
+
+def fastest_decay(name, tensor, outer, forward, backward, spacing):
+    """The largest eigenvalue, per mm^2, of what a scheme multiplies u by while a and T (3, 3, E) stay fixed."""
+    d = difference_matrices(forward, backward, spacing)
+    choices = list(product((0, 1), repeat=3)) if name == "symmetric" else [(0, 0, 0)]
+    rate = np.zeros((len(outer), len(outer)))
+    for sides in choices:
+        g = np.stack([d[side, a] for a, side in enumerate(sides)])
+        rate += np.einsum("ami,abm,bmj->ij", g, tensor, g, optimize=True) / len(choices)
+    root = np.sqrt(outer)
+    return float(np.linalg.eigvalsh(root[:, None] * rate * root)[-1])
 
 
 # --- interpolation on a sheet ---------------------------------------------------------------------------------------

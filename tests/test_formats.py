@@ -129,7 +129,7 @@ def test_several_frames_are_refused_before_reading(tmp_path, suffix):
     for read in (read_grid, read_volume):
         with pytest.raises(RefusedError) as refusal:
             read(path)
-        assert "several frames are not supported yet: found 4-D (x, y, z, 2)" in one_line(refusal.value)
+        assert "several frames or channels, 4-D (x, y, z, 2)" in one_line(refusal.value)
 
 
 @pytest.mark.parametrize("dtype", [np.bool_, np.uint8, np.int16, np.int64, ">i4", np.float16, np.float64])

@@ -153,3 +153,39 @@ def test_info_goes_on_after_a_bad_file(pair, tmp_path):
     assert str(a) in run.out
     assert done("info", levelset, "-q").out == ""
     assert "FILE" in refused("info")
+
+
+# --- several channels, complex numbers ---------------------------------------------------------------------------
+
+
+def test_channels_are_compared_value_by_value(tmp_path):
+    data = np.stack([noisy(), 2 * noisy(), 3 * noisy()], -1)
+    shifted = data.copy()
+    shifted[..., 1] += np.float32(2)
+    shifted[0, 0, 0, 2] = np.nan
+    a, b = nifti(tmp_path / "a.nii.gz", data), nifti(tmp_path / "b.nii.gz", shifted)
+    found = figures(a, b)
+    assert (found["compared"], found["only_in_a"]) == (data.size - 1, 1)
+    assert found["rms"] == pytest.approx(2 / np.sqrt(3), rel=1e-3)
+    near = figures(a, b, "--levelset", nifti(tmp_path / "psi.nii.gz", ball()), "--within", "1")
+    assert near["compared"] == 3 * (np.abs(ball()) <= 1).sum()
+    assert "shapes differ" in refused("compare", a, nifti(tmp_path / "one.nii.gz", noisy()))
+
+
+def test_complex_numbers_are_compared_by_their_parts(tmp_path):
+    waves = (noisy() + 1j).astype(np.complex64)
+    a, b = npy(tmp_path / "a.npy", waves), npy(tmp_path / "b.npy", waves + 3j)
+    found = figures(a, b)
+    assert found["compared"] == 2 * waves.size
+    assert (found["max_abs"], found["mean"]) == (pytest.approx(3), pytest.approx(1.5))
+
+
+def test_info_tells_channels_and_complex_numbers(tmp_path):
+    frames = nifti(tmp_path / "f.nii.gz", np.stack([noisy(), noisy()], -1))
+    waves = npy(tmp_path / "c.npy", np.full((4, 5, 6), 3 + 4j))
+    out = done("info", frames, waves).out
+    assert "16 x 16 x 16 voxels" in out
+    assert "2 channels or frames" in out
+    assert "complex numbers" in out
+    assert "magnitude: 5 to 5, median 5" in out
+    assert "level set" not in out

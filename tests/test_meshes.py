@@ -151,3 +151,39 @@ def test_colours():
     assert (np.diff(colours[2:99].astype(float) @ [0.2126, 0.7152, 0.0722]) > 0).all()  # ever lighter
     assert rgb(np.full(3, 7.0)).tolist() == [colours[50].tolist()] * 3
     assert rgb(np.full(2, np.nan)).tolist() == [[128, 128, 128]] * 2
+
+
+# --- several values at a vertex ----------------------------------------------------------------------------------
+
+SEVERAL = np.stack([VALUES, VALUES * 2, VALUES - 5], -1)
+
+
+def test_gifti_of_several_values(tmp_path):
+    _, path = write_mesh(tmp_path / "lh.surf.gii", Mesh(VERTICES, FACES, SEVERAL))
+    maps = nib.load(path).darrays
+    assert [one.meta["Name"] for one in maps] == ["value 1", "value 2", "value 3"]
+    assert all(np.array_equal(one.data, SEVERAL[:, k], equal_nan=True) for k, one in enumerate(maps))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".vtk"])
+@pytest.mark.parametrize("cells", [FACES, CURVE.cells])
+def test_numbers_of_several_values(tmp_path, suffix, cells):
+    path = tmp_path / f"m{suffix}"
+    write_mesh(path, Mesh(VERTICES, cells, SEVERAL))
+    if suffix == ".ply" and len(cells[0]) == 2:
+        header = path.read_bytes().split(b"end_header")[0]
+        assert all(f"property float value_{k}".encode() in header for k in (1, 2, 3))
+        return
+    found = meshio.read(path).point_data
+    assert all(np.array_equal(found[f"value_{k + 1}"], SEVERAL[:, k], equal_nan=True) for k in range(3))
+
+
+def test_colours_of_several_values():
+    grey = [128, 128, 128]
+    true = np.array([[0, 127.6, 255], [np.nan, 0, 0], [1, 2, 3]])
+    assert rgb(true).tolist() == [[0, 128, 255], grey, [1, 2, 3]]
+    signed = true - 100
+    assert np.array_equal(rgb(signed), rgb(np.linalg.norm(signed, axis=1)))
+    assert np.array_equal(rgb(SEVERAL[:, :2]), rgb(np.sqrt(5) * VALUES))
+    assert rgb(np.full((2, 3), np.nan)).tolist() == [grey, grey]
+    assert not np.array_equal(rgb(true / 255), np.rint(true / 255))  # a field of small numbers is no picture

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from command import done, refused
 from scipy.ndimage import map_coordinates
 
 from beltrami_cli import phantoms
 from beltrami_cli.errors import RefusedError
+from beltrami_cli.formats import read_volume
 
 DISTANCES = ["torus", "sphere", "plane", "curve", "portrait"]
 
@@ -144,3 +146,21 @@ def test_volumes_remember_the_shape_of_the_arrays():
     volumes = phantoms.curve(32).volumes()
     assert list(volumes) == ["levelset", "clean", "noisy"]
     assert all(v.data.shape == (32, 32, 1) and v.file_shape == (32, 32) for v in volumes.values())
+
+
+def test_portrait_in_colours():
+    grey, rgb = phantoms.portrait(24, noise=10), phantoms.portrait(24, noise=10, map="rgb")
+    assert np.array_equal(grey.levelset, rgb.levelset)
+    assert rgb.clean.shape == rgb.noisy.shape == (24, 24, 24, 3)
+    # Luminance by the weights of the sRGB primaries is how the grey picture was made.
+    assert np.abs(rgb.clean @ [0.2125, 0.7154, 0.0721] - grey.clean).max() < 0.01
+    assert np.std(rgb.noisy - rgb.clean, axis=(0, 1, 2)) == pytest.approx([10] * 3, rel=0.03)
+    assert [v.channels for v in rgb.volumes().values()] == [1, 3, 3]
+    with pytest.raises(RefusedError, match="expected grey or rgb"):
+        phantoms.portrait(24, map="mixed")
+
+
+def test_command_writes_colours(tmp_path):
+    done("phantom", "portrait", tmp_path, "--size", "16", "--map", "rgb")
+    assert read_volume(tmp_path / "noisy.nii.gz", channels=True).data.shape == (16, 16, 16, 3)
+    assert "belongs to the phantom torus" in refused("phantom", "portrait", tmp_path / "x", "--map", "pieces")

@@ -71,3 +71,37 @@ def test_planes():
     affine[0, 3] = 0.5
     got = resample(image, Grid((3, 3, 1), affine)).data
     assert np.allclose(got[:, :, 0], image.data[:3, :, 0] + 1.5)
+
+
+def test_channels_and_complex_numbers_are_moved_one_by_one():
+    source, target = linear_volume(TWINS["RAS"]), TWINS["oblique"]
+    one, other = resample(source, target).data, resample(source.with_data(source.data**2), target).data
+    several = resample(Volume(np.stack([source.data, source.data**2], -1), source.grid), target)
+    assert several.data.shape == (*target.shape, 2)
+    assert np.array_equal(several.data, np.stack([one, other], -1), equal_nan=True)
+    waves = resample(source.with_data(source.data + 1j * source.data**2), target).data
+    known = np.isfinite(one)
+    assert np.array_equal(known, np.isfinite(waves))
+    assert np.allclose(waves[known], (one + 1j * other)[known], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "middle"), [(350, 20, 5), (10, 50, 30), (-170, 150, 170), (-170, 170, -180)]
+)
+def test_angles_turn_through_the_wrap(first, second, middle):
+    angles = np.full((2, 3, 3), np.float32(first))
+    angles[1] = second
+    half = Grid((1, 3, 3), np.array([[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+    moved = resample(Volume(angles, Grid.from_spacing(angles.shape)), half, period=360.0)
+    assert moved.data.dtype == np.float32
+    off = (moved.data - middle + 180) % 360 - 180
+    assert np.abs(off).max() < 1e-4
+    low = -180 if first < 0 else 0
+    assert (low <= moved.data).all() and (moved.data < low + 360).all()
+
+
+def test_missing_angles_take_no_part():
+    angles = np.array([[[350.0, np.nan, 20.0]]])
+    grid = Grid.from_spacing(angles.shape)
+    moved = resample(Volume(angles, grid), grid, period=360.0).data
+    assert np.allclose(moved, angles, equal_nan=True)

@@ -49,13 +49,13 @@ def compare(
     if as_json:
         say(quiet, json.dumps({**found.as_dict(), "broken": broken}, indent=2))
     else:
-        say(quiet, f"compared  {found.compared} voxels ({found.only_in_a} only in A, {found.only_in_b} only in B)")
+        say(quiet, f"compared  {found.compared} values ({found.only_in_a} only in A, {found.only_in_b} only in B)")
         say(quiet, f"B - A     max {found.max_abs:.6g}, rms {found.rms:.6g}, mean {found.mean:.6g}")
         say(quiet, f"psnr      {found.psnr:.2f} dB over a range of {found.data_range:.6g}")
         say(quiet, f"correlation {found.correlation:.6f}")
     judged = any(limit is not None for limit in (max_abs, max_rms, min_psnr))
     if judged and found.only_in_a:
-        note(quiet, f"warning: {found.only_in_a} voxels with a value in A have none in B: no tolerance looks at them")
+        note(quiet, f"warning: {found.only_in_a} values of A are missing in B: no tolerance looks at them")
     for line in broken:
         click.echo(f"beltrami: out of tolerance: {line}", err=True)
     return 1 if broken else 0

@@ -11,6 +11,7 @@ from beltrami_cli.cli.common import Command, overwrite_option, say
 from beltrami_cli.errors import RefusedError
 
 NAMES = ("torus", "sphere", "plane", "curve", "portrait", "sulcus")
+MAPS = {"torus": ("mixed", "pieces", "smooth"), "portrait": ("grey", "rgb")}
 
 
 @click.command(cls=Command)
@@ -22,7 +23,12 @@ NAMES = ("torus", "sphere", "plane", "curve", "portrait", "sulcus")
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the noise.")
 @click.option("--format", "suffix", type=click.Choice(["nii.gz", "mha", "npy"]), default="nii.gz", show_default=True)
-@click.option("--map", "torus_map", type=click.Choice(["mixed", "pieces", "smooth"]), help="Data on the torus.")
+@click.option(
+    "--map",
+    "painting",
+    type=click.Choice([map for maps in MAPS.values() for map in maps]),
+    help="Data on the torus (mixed, pieces, smooth) or the portrait (grey, rgb).",
+)
 @click.option("--gap", type=float, metavar="VOXELS", help="Between the banks of the sulcus.")
 @overwrite_option
 def phantom(
@@ -32,7 +38,7 @@ def phantom(
     noise: float | None,
     seed: int,
     suffix: str,
-    torus_map: str | None,
+    painting: str | None,
     gap: float | None,
     overwrite: bool | None,
     quiet: bool,
@@ -41,11 +47,13 @@ def phantom(
     """Write a surface with known data to OUTDIR: levelset, clean and noisy volumes."""
     from beltrami_cli import formats, phantoms
 
-    options: dict[str, Any] = {"map": torus_map, "gap": gap}
+    options: dict[str, Any] = {"map": painting, "gap": gap}
     options = {key: value for key, value in options.items() if value is not None}
-    for key, owner in (("map", "torus"), ("gap", "sulcus")):
-        if key in options and name != owner:
-            raise RefusedError(f"--{key} belongs to the phantom {owner}; found {name}; drop it")
+    if painting is not None and painting not in MAPS.get(name, ()):
+        owner = next(owner for owner, maps in MAPS.items() if painting in maps)
+        raise RefusedError(f"--map {painting} belongs to the phantom {owner}; found {name}; drop it")
+    if gap is not None and name != "sulcus":
+        raise RefusedError(f"--gap belongs to the phantom sulcus; found {name}; drop it")
     made = phantoms.make(name, size=size, noise=noise, seed=seed, **options)
     try:
         outdir.mkdir(parents=True, exist_ok=True)

@@ -5,7 +5,7 @@ The only place that knows RAS from LPS, units from millimetres and one header fr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,23 +13,28 @@ from numpy.typing import DTypeLike
 
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.formats import checks, gifti, metaimage, mgh, nifti, npy, plain_mesh, png
+from beltrami_cli.formats.series import Series, counted
 from beltrami_cli.formats.staging import Stage
 from beltrami_cli.grid import Grid, Volume
 from beltrami_cli.surface import Mesh
 
 __all__ = [
+    "Series",
     "Stage",
     "input_files",
     "mesh_beside",
     "mesh_files",
     "mesh_format",
+    "open_series",
     "read_grid",
+    "read_layout",
     "read_volume",
     "require_writable",
     "stem",
     "volume_files",
     "volume_format",
     "write_mesh",
+    "write_series",
     "write_volume",
 ]
 
@@ -65,47 +70,74 @@ def stem(path: Path) -> Path:
     return path.with_name(path.name[: len(path.name) - len(suffix)])
 
 
-def read_grid(path: Path, *, spacing: float | Sequence[float] | None = None) -> Grid:
+def read_grid(
+    path: Path, *, spacing: float | Sequence[float] | None = None, channels: bool = False, plane: bool = False
+) -> Grid:
     """The grid of a volume from its header alone; arguments and errors as `read_volume`."""
-    path = Path(path)
-    kind = _require_readable(path, spacing)
-    match kind:
-        case "NIfTI":
-            return nifti.read_grid(path)
-        case "MetaImage":
-            return metaimage.read_grid(path)
-        case "MGH":
-            return mgh.read_grid(path)
-        case "PNG":
-            return png.read_grid(path)
-        case _:
-            return npy.read_grid(path, _steps(spacing))
+    return _look(path, spacing, np.float32, channels, plane).grid
 
 
-def read_volume(path: Path, *, spacing: float | Sequence[float] | None = None, dtype: DTypeLike = np.float32) -> Volume:
+def read_layout(path: Path, *, plane: bool = False) -> tuple[int, bool]:
+    """How many channels or frames a file has, and whether its numbers are complex, from its header alone.
+
+    Raises as `read_volume` with `channels`.
+    """
+    found = _look(path, None, np.float32, True, plane)
+    return found.count, found.is_complex
+
+
+def read_volume(
+    path: Path,
+    *,
+    spacing: float | Sequence[float] | None = None,
+    dtype: DTypeLike = np.float32,
+    channels: bool = False,
+    plane: bool = False,
+) -> Volume:
     """Read a volume as `dtype` (float32 or float64), indexed (i, j, k) alike whatever the format, on a RAS mm grid.
 
     Trailing axes of length 1 are dropped and a plane gets one slice; `Volume.file_shape` keeps the shape as stored.
     NaN and infinite values stay as they are. The array has the file's memory order.
 
     spacing: mm per voxel, one number or one per axis, for NPY, which holds none (default 1).
+    channels: accept several values per voxel - a fourth axis, a NIfTI vector's fifth, vector pixels, colours (without
+        their transparency) - on a last axis of the data, and complex numbers, as complex64 for float32 and complex128
+        for float64.
+    plane: with `channels`, an NPY array of three axes is a plane (nx, ny, K); else it is a volume.
 
-    Raises RefusedError for an unknown suffix, a missing file, several frames, complex or coloured pixels, or
-    `spacing` where the format has its own; DataError where the content cannot be read.
+    Raises RefusedError for an unknown suffix, a missing file, several values or complex ones without `channels`,
+    several complex ones, or `spacing` where the format has its own; DataError where the content cannot be read.
     """
     path = Path(path)
     kind = _require_readable(path, spacing)
     match kind:
         case "NIfTI":
-            return nifti.read(path, dtype)
+            return nifti.read(path, dtype, channels=channels)
         case "MetaImage":
-            return metaimage.read(path, dtype)
+            return metaimage.read(path, dtype, channels=channels)
         case "MGH":
-            return mgh.read(path, dtype)
+            return mgh.read(path, dtype, channels=channels)
         case "PNG":
-            return png.read(path, dtype)
+            return png.read(path, dtype, channels=channels)
         case _:
-            return npy.read(path, _steps(spacing), dtype)
+            return npy.read(path, _steps(spacing), dtype, channels=channels, plane=plane)
+
+
+def open_series(
+    path: Path, *, spacing: float | Sequence[float] | None = None, dtype: DTypeLike = np.float32, plane: bool = False
+) -> Series:
+    """The frames or channels of a file, read as `dtype` one at a time; a single volume is a series of one.
+
+    NIfTI and MGH stay open and NPY is mapped, so that one frame is in memory; MetaImage, PNG and coloured NIfTI are
+    read whole at the first frame. Arguments and errors as `read_volume` with `channels`; complex numbers are refused.
+    """
+    found = _look(path, spacing, dtype, True, plane)
+    if found.is_complex:
+        raise RefusedError(
+            f"{path}: expected frames of real values; found a complex volume; drop --independent: real and imaginary "
+            "part belong together"
+        )
+    return found
 
 
 def input_files(path: Path) -> list[Path]:
@@ -134,32 +166,61 @@ def volume_files(path: Path) -> list[Path]:
             return [path]
 
 
-def require_writable(path: Path, grid: Grid) -> None:
-    """Raise RefusedError where a volume on this grid cannot be written to this path: before anything is computed."""
+def require_writable(path: Path, grid: Grid, *, channels: int = 1, is_complex: bool = False) -> None:
+    """Raise RefusedError where such a volume on this grid cannot be written to this path: before anything is computed.
+
+    channels: values per voxel, which every written format can hold. is_complex: NIfTI and NPY alone hold such.
+    """
     path = Path(path)
     volume_files(path)
-    if volume_format(path) == "MetaImage":
-        metaimage.require_writable(path, grid)
+    match volume_format(path):
+        case "MetaImage":
+            metaimage.require_writable(path, grid, is_complex=is_complex)
+        case "MGH" if is_complex:
+            raise RefusedError(f"{path}: MGH cannot hold complex numbers; write NIfTI or NPY")
+    if is_complex and channels > 1:
+        raise RefusedError(f"{path}: cannot hold {channels} complex numbers per voxel; expected one")
 
 
 def write_volume(path: Path, volume: Volume, *, dtype: DTypeLike = np.float32) -> None:
-    """Write `volume.data` as `dtype` (float32 or float64; MGH always float32) in the shape `volume.file_shape`.
+    """Write `volume.data` as `dtype` in the shape `volume.file_shape`, channels or frames on the last axis.
 
+    dtype: float32, float64 (MGH: float32 all the same) or, for masks, uint8; complex data keep its precision. In
+    MetaImage channels are vector pixels, unless the volume came from frames of that format.
     The header is that of the file which the volume came from where the format is the same, else a fresh one. Makes
     `volume_files(path)`, replacing what is there. Raises RefusedError as `require_writable`, DataError where the
     file cannot be written.
     """
     path = Path(path)
-    volume_files(path)
+    require_writable(path, volume.grid, channels=volume.channels, is_complex=np.iscomplexobj(volume.data))
     match volume_format(path):
         case "NIfTI":
             nifti.write(path, volume, dtype)
         case "MetaImage":
             metaimage.write(path, volume, dtype)
         case "MGH":
-            mgh.write(path, volume)
+            mgh.write(path, volume, dtype)
         case _:
             npy.write(path, volume, dtype)
+
+
+def write_series(path: Path, series: Series, frames: Iterable[np.ndarray], *, dtype: DTypeLike = np.float32) -> None:
+    """Write `series.count` frames of shape `series.grid.shape` as they come, with the series' header.
+
+    NIfTI and NPY (there in Fortran order) are written frame by frame; MGH and MetaImage gather all of them first.
+    Otherwise as `write_volume`. Raises ValueError where frames are missing or too many.
+    """
+    path = Path(path)
+    require_writable(path, series.grid, channels=series.count)
+    match volume_format(path):
+        case "NIfTI":
+            nifti.write_series(path, series, frames, dtype)
+        case "NPY":
+            npy.write_series(path, series, frames, dtype)
+        case _:
+            gathered = np.stack([frame.astype(dtype) for frame in counted(series, frames)], -1)
+            data = gathered if series.count > 1 else gathered[..., 0]
+            write_volume(path, Volume(data, series.grid, series.shape_to_write(), series.header), dtype=dtype)
 
 
 def mesh_beside(path: Path, *, curve: bool = False) -> Path:
@@ -185,7 +246,8 @@ def mesh_files(path: Path, *, values: bool = True, curve: bool = False) -> list[
 def write_mesh(path: Path, mesh: Mesh) -> list[Path]:
     """Write the mesh in RAS mm, vertices and faces in the order given, and return the files made.
 
-    Values are numbers in PLY (`value`), VTK and GIFTI, and colours in PLY, OBJ and GLB; STL holds the shape alone.
+    Values are numbers in PLY, VTK and GIFTI (`value`; `value_1`, in GIFTI `value 1`, and so on for several channels)
+    and colours in PLY, OBJ and GLB (`colours.rgb`: true ones, or of the value or magnitude); STL holds the shape alone.
     Raises RefusedError as `mesh_files`, DataError where a file cannot be written.
     """
     path = Path(path)
@@ -218,6 +280,23 @@ def _require_readable(path: Path, spacing: float | Sequence[float] | None) -> st
     if spacing is not None and kind != "NPY":
         raise RefusedError(f"{path}: {kind} has its own spacing; --spacing is for .npy only")
     return kind
+
+
+def _look(path: Path, spacing: float | Sequence[float] | None, dtype: DTypeLike, channels: bool, plane: bool) -> Series:
+    """What the header says, with values to be read on demand."""
+    path = Path(path)
+    kind = _require_readable(path, spacing)
+    match kind:
+        case "NIfTI":
+            return nifti.open_series(path, dtype, channels=channels)
+        case "MetaImage":
+            return metaimage.open_series(path, dtype, channels=channels)
+        case "MGH":
+            return mgh.open_series(path, dtype, channels=channels)
+        case "PNG":
+            return png.open_series(path, dtype, channels=channels)
+        case _:
+            return npy.open_series(path, _steps(spacing), dtype, channels=channels, plane=plane)
 
 
 def _steps(spacing: float | Sequence[float] | None) -> float | tuple[float, ...]:

@@ -103,8 +103,8 @@ def layout(
 
 def _several(axes: tuple[int, ...], per_voxel: int) -> str:
     if per_voxel > 1:
-        return f"{per_voxel} channels in each (vector or coloured pixels)"
-    return f"several channels or frames, {len(axes)}-D ({', '.join(('x', 'y', 'z', *map(str, axes[3:])))})"
+        return f"{per_voxel} channels in each (vector or RGB pixels)"
+    return f"several frames or channels, {len(axes)}-D ({', '.join(('x', 'y', 'z', *map(str, axes[3:])))})"
 
 
 def require_numbers(path: Path, dtype: np.dtype, count: int, *, channels: bool = False) -> None:
@@ -123,8 +123,13 @@ def require_numbers(path: Path, dtype: np.dtype, count: int, *, channels: bool =
         raise RefusedError(f"{path}: expected numbers; found values of type {dtype}; convert them")
 
 
+def with_three_axes(file_shape: tuple[int, ...], channels: int) -> tuple[int, ...]:
+    """The shape in a format where channels never stand on the third axis: a picture (nx, ny, K) gets one slice."""
+    return (*file_shape[:2], 1, channels) if channels > 1 and len(file_shape) == 3 else file_shape
+
+
 def number_type(asked: DTypeLike, found: np.dtype) -> np.dtype:
-    """The type to hold values of type `found` in: `asked`, or its complex twin (float32 -> complex64) for complex ones."""
+    """`asked`, or its complex twin (float32 -> complex64) where values of type `found` are complex."""
     return np.result_type(asked, np.complex64) if found.kind == "c" else np.dtype(asked)
 
 

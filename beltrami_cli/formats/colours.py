@@ -19,7 +19,22 @@ _PERCENTILES = (2.0, 98.0)
 
 
 def rgb(values: np.ndarray) -> np.ndarray:
-    """(V, 3) uint8 colours of (V,) values over their 2nd to 98th percentile; grey where they are not finite."""
+    """(V, 3) uint8 colours of values (V,) or (V, K); grey where they are not finite.
+
+    Three channels that lie within 0 to 255, and reach beyond 1, are colours already. Of other channels the magnitude is
+    shown. A single value runs through the map from its 2nd to its 98th percentile.
+    """
+    if values.ndim == 1:
+        return _mapped(values)
+    known = np.isfinite(values).all(1)
+    if values.shape[1] == 3 and known.any() and values[known].min() >= 0 and 1 < values[known].max() <= 255:
+        colours = np.full(values.shape, _MISSING, np.uint8)
+        colours[known] = np.rint(values[known])
+        return colours
+    return _mapped(np.linalg.norm(values, axis=1))
+
+
+def _mapped(values: np.ndarray) -> np.ndarray:
     colours = np.full((len(values), 3), _MISSING, np.uint8)
     finite = np.isfinite(values)
     if not finite.any():

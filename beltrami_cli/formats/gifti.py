@@ -21,7 +21,7 @@ def values_file(path: Path) -> Path:
 
 
 def write(path: Path, mesh: Mesh) -> None:
-    """Write vertices as float32 and triangles as int32, and the values, where there are any, as one float32 map."""
+    """Write vertices as float32 and triangles as int32, and the values, where there are any, as float32 maps."""
     from nibabel import gifti
 
     space = gifti.GiftiCoordSystem(dataspace=_SCANNER, xformspace=_SCANNER, xform=np.eye(4))
@@ -29,7 +29,8 @@ def write(path: Path, mesh: Mesh) -> None:
     triangles = _array(mesh.cells, "NIFTI_INTENT_TRIANGLE", np.int32)
     _save(path, [vertices, triangles])
     if mesh.values is not None:
-        _save(values_file(path), [_array(mesh.values, "NIFTI_INTENT_NONE", np.float32, meta={"Name": "value"})])
+        maps = mesh.named_values().items()
+        _save(values_file(path), [_array(v, "NIFTI_INTENT_NONE", np.float32, meta={"Name": name}) for name, v in maps])
 
 
 def _array(values: np.ndarray, intent: str, dtype: type[np.generic], **options: Any) -> Any:

@@ -13,37 +13,46 @@ from numpy.typing import DTypeLike
 
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.formats import checks
-from beltrami_cli.grid import Grid, Volume
+from beltrami_cli.formats.series import Series, frames_of
+from beltrami_cli.grid import Grid, Volume, with_channels
 
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class MetaHeader:
-    """Template for writing: the entries of the header that say more than the grid does."""
+    """Template for writing: the entries of the header that say more than the grid does.
+
+    frame_step, frame_origin: of the fourth axis, where frames stand on one and are not the channels of vector pixels.
+    """
 
     entries: dict[str, str]
+    frame_step: float | None = None
+    frame_origin: float = 0.0
 
 
-def read_grid(path: Path) -> Grid:
-    """The grid alone; no voxel is read. Raises as `read`."""
-    return _grid(path, _open(path))
-
-
-def read(path: Path, dtype: DTypeLike) -> Volume:
-    """The volume, in the file's (Fortran) memory order.
+def read(path: Path, dtype: DTypeLike, *, channels: bool = False) -> Volume:
+    """The volume, in the file's (Fortran) memory order; frames and the channels of vector pixels on the last axis.
 
     Raises DataError where the content cannot be read, RefusedError where it is no single real volume.
     """
     import SimpleITK as sitk
 
     reader = _open(path)
-    grid = _grid(path, reader)
+    grid, count, file_shape = _look(path, reader, channels)
     with checks.reading(path, "MetaImage"), checks.native_stderr_muted():
         image = reader.Execute()
-        data = sitk.GetArrayFromImage(image).T.astype(dtype, copy=False)
-    entries = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys() if not key.startswith("ITK_")}
-    return Volume(data.reshape(grid.shape), grid, data.shape, MetaHeader(entries))
+        data = sitk.GetArrayFromImage(image).astype(dtype, copy=False)
+    data = np.moveaxis(data.T, 0, -1) if image.GetNumberOfComponentsPerPixel() > 1 else data.T
+    data = data.reshape((*grid.shape, count) if count > 1 else grid.shape, order="A")
+    return Volume(data, grid, file_shape, _header(reader))
+
+
+def open_series(path: Path, dtype: DTypeLike, *, channels: bool = True) -> Series:
+    """The frames; opening it reads the header alone, the first frame reads the whole file. Raises as `read`."""
+    reader = _open(path)
+    grid, count, file_shape = _look(path, reader, channels)
+    return Series(grid, count, file_shape, _header(reader), frames_of(lambda: read(path, dtype, channels=channels)))
 
 
 def files(path: Path) -> list[Path]:
@@ -54,27 +63,40 @@ def files(path: Path) -> list[Path]:
     return [path.with_suffix(".raw"), path] if path.suffix == ".mhd" else [path]
 
 
-def require_writable(path: Path, grid: Grid) -> None:
-    """Raise RefusedError where the grid is sheared: the format's directions are orthogonal."""
+def require_writable(path: Path, grid: Grid, *, is_complex: bool = False) -> None:
+    """Raise RefusedError for a sheared grid, as the format's directions are orthogonal, and for complex numbers."""
     if grid.is_sheared():
         raise RefusedError(f"{path}: MetaImage cannot hold a sheared grid; found {grid.describe()}; write NIfTI")
+    if is_complex:
+        raise RefusedError(f"{path}: MetaImage cannot hold complex numbers; write NIfTI or NPY")
 
 
 def write(path: Path, volume: Volume, dtype: DTypeLike) -> None:
-    """Write .mha compressed, .mhd with plain raw voxels beside it; raises RefusedError for a sheared grid."""
+    """Write .mha compressed, .mhd with plain raw voxels beside it; channels as vector pixels, or frames as they were.
+
+    Raises RefusedError as `require_writable`.
+    """
     import SimpleITK as sitk
 
-    require_writable(path, volume.grid)
-    data = np.asarray(volume.data, dtype).reshape(volume.file_shape)
+    require_writable(path, volume.grid, is_complex=np.iscomplexobj(volume.data))
+    header = volume.header if isinstance(volume.header, MetaHeader) else MetaHeader({})
+    vectors = volume.channels > 1 and header.frame_step is None
+    shape = volume.file_shape
+    if volume.channels > 1:
+        spatial = with_channels(shape, volume.channels, 1) if vectors else volume.grid.shape
+        shape = (*spatial, volume.channels)
+    data = np.asarray(volume.data, dtype).reshape(shape)
+    array = np.moveaxis(data, -1, 0).T if vectors else data.T
     with checks.writing(path), checks.native_stderr_muted():
-        image = sitk.GetImageFromArray(data.T, isVector=False)
-        direction, spacing, origin = _to_lps(volume.grid, data.ndim)
+        image = sitk.GetImageFromArray(array, isVector=vectors)
+        direction, spacing, origin = _to_lps(volume.grid, image.GetDimension())
+        if len(spacing) == 4 and header.frame_step is not None:
+            spacing[3], origin[3] = header.frame_step, header.frame_origin
         image.SetDirection(direction.ravel().tolist())
         image.SetSpacing(spacing.tolist())
         image.SetOrigin(origin.tolist())
-        if isinstance(volume.header, MetaHeader):
-            for key, value in volume.header.entries.items():
-                image.SetMetaData(key, value)
+        for key, value in header.entries.items():
+            image.SetMetaData(key, value)
         sitk.WriteImage(image, os.fspath(path), useCompression=path.suffix == ".mha")
 
 
@@ -88,10 +110,14 @@ def _open(path: Path) -> Any:
     with checks.reading(path, "MetaImage"), checks.native_stderr_muted():
         reader.ReadImageInformation()
     _require_voxels(path)
-    channels = reader.GetNumberOfComponents()
-    if channels != 1:
-        raise RefusedError(f"{path}: expected one number per voxel; found {channels} channels; extract one channel")
     return reader
+
+
+def _header(reader: Any) -> MetaHeader:
+    entries = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys() if not key.startswith("ITK_")}
+    if len(reader.GetSize()) < 4:
+        return MetaHeader(entries)
+    return MetaHeader(entries, reader.GetSpacing()[3], reader.GetOrigin()[3])
 
 
 def input_files(path: Path) -> list[Path]:
@@ -109,8 +135,14 @@ def _require_voxels(path: Path) -> None:
             raise RefusedError(f"{path}: half of a pair; expected {part.name} beside it; fetch that file too")
 
 
-def _grid(path: Path, reader: Any) -> Grid:
-    shape = checks.spatial_shape(path, reader.GetSize())
+def _look(path: Path, reader: Any, channels: bool) -> tuple[Grid, int, tuple[int, ...]]:
+    """The grid, the number of channels or frames, and the shape with vector pixels on a last axis."""
+    size, components = tuple(map(int, reader.GetSize())), reader.GetNumberOfComponents()
+    shape, count = checks.layout(path, size, per_voxel=components, channels=channels)
+    return _grid(path, reader, shape), count, (*size, components) if components > 1 else size
+
+
+def _grid(path: Path, reader: Any, shape: tuple[int, int, int]) -> Grid:
     axes = len(reader.GetSize())
     used = min(axes, 3)
     lps = np.eye(4)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from numpy.typing import DTypeLike
 
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.formats import checks
+from beltrami_cli.formats.series import Series, append_frames, appending, frames_behind, frames_of
 from beltrami_cli.grid import Grid, Volume
 
 _SCANNER = 1  # NIFTI_XFORM_SCANNER_ANAT
@@ -29,20 +32,34 @@ class NiftiHeader:
         return _MM_PER_UNIT[_units(self.header)[0]]
 
 
-def read_grid(path: Path) -> Grid:
-    """The grid alone; no voxel is read. Raises as `read`."""
-    return _open(path)[1].grid
+def read(path: Path, dtype: DTypeLike, *, channels: bool = False) -> Volume:
+    """The volume, scaled by slope and intercept, in the file's (Fortran) memory order; raises as `open_series`.
 
-
-def read(path: Path, dtype: DTypeLike) -> Volume:
-    """The volume, scaled by slope and intercept, in the file's (Fortran) memory order.
-
-    Raises DataError where the content cannot be read, RefusedError where it is no single real volume.
+    RGB24 and RGBA32 voxels become channels, without the transparency.
     """
-    image, template = _open(path)
+    image, template, count, file_shape = _open(path, channels)
+    dtype = checks.number_type(dtype, image.get_data_dtype())
     with checks.reading(path, "NIfTI"):
-        data = image.get_fdata(dtype=np.dtype(dtype), caching="unchanged")
-    return Volume(data.reshape(template.grid.shape), template.grid, tuple(map(int, image.shape)), template)
+        data = np.asanyarray(image.dataobj) if _is_coloured(image) else np.asanyarray(image.dataobj, dtype)
+        if _is_coloured(image):
+            data = np.stack([data[name] for name in "RGB"], -1).astype(dtype)
+    shape = (*template.grid.shape, count) if count > 1 else template.grid.shape
+    return Volume(data.reshape(shape, order="A"), template.grid, file_shape, template)
+
+
+def open_series(path: Path, dtype: DTypeLike, *, channels: bool = True) -> Series:
+    """The frames, one in memory at a time (colours are read whole); opening it reads the header alone.
+
+    Raises DataError where the content cannot be read, RefusedError where it is no single real volume: with `channels`,
+    where it is neither real channels or frames nor a single complex volume.
+    """
+    image, template, count, file_shape = _open(path, channels)
+    dtype = checks.number_type(dtype, image.get_data_dtype())
+    if _is_coloured(image):
+        frame = frames_of(lambda: read(path, dtype, channels=True))
+    else:
+        frame = frames_behind(path, "NIfTI", image.dataobj, template.grid.shape, count, dtype)
+    return Series(template.grid, count, file_shape, template, frame, dtype.kind == "c")
 
 
 def files(path: Path) -> list[Path]:
@@ -54,10 +71,39 @@ def files(path: Path) -> list[Path]:
 
 def write(path: Path, volume: Volume, dtype: DTypeLike) -> None:
     """Write with slope 1 and intercept 0; header, units and both transforms are the template's where there is one."""
+    data = np.asarray(volume.data, checks.number_type(dtype, volume.data.dtype))
+    data = data.reshape(checks.with_three_axes(volume.file_shape, volume.channels))
+    with checks.writing(path):
+        image = _image(path, data, volume.grid, volume.header)
+        _forget_stale_range(image.header, data)
+        image.to_filename(path)
+
+
+def write_series(path: Path, series: Series, frames: Iterable[np.ndarray], dtype: DTypeLike) -> None:
+    """As `write`, of frames that come one at a time."""
+    shape = checks.with_three_axes(series.shape_to_write(), series.count)
+    with checks.writing(path):
+        # Announces all the frames, and holds none of them.
+        header = _image(path, np.broadcast_to(np.zeros((), dtype), shape), series.grid, series.header).header
+        header.set_slope_inter(1, 0)
+        header["cal_min"] = header["cal_max"] = 0  # the range to come is not known yet
+        start = io.BytesIO()
+        header.write_to(start)
+    voxels, *announcement = files(path)
+    for part in announcement:
+        with appending(part) as append:
+            append(start.getvalue())
+    with appending(voxels) as append:
+        if not announcement:
+            append(start.getvalue().ljust(header.get_data_offset(), b"\0"))
+        append_frames(append, series, frames, header.get_data_dtype())
+
+
+def _image(path: Path, data: np.ndarray, grid: Grid, template: Any) -> Any:
+    """nibabel's image of these voxels, placed, with the template's header where it is one of NIfTI."""
     import nibabel as nib
 
-    data = np.asarray(volume.data, dtype).reshape(volume.file_shape)
-    template = volume.header if isinstance(volume.header, NiftiHeader) else None
+    template = template if isinstance(template, NiftiHeader) else None
     pair, version_2 = len(files(path)) == 2, template is not None and template.header["sizeof_hdr"] == 540
     image_class: Any = {
         (False, False): nib.Nifti1Image,
@@ -65,14 +111,13 @@ def write(path: Path, volume: Volume, dtype: DTypeLike) -> None:
         (True, False): nib.Nifti1Pair,
         (True, True): nib.Nifti2Pair,
     }[pair, version_2]
-    with checks.writing(path):
-        image = image_class(data, None, None if template is None else template.header, dtype=data.dtype)
-        _place(image, volume.grid, template)
-        _forget_stale_range(image.header, data)
-        image.to_filename(path)
+    image = image_class(data, None, None if template is None else template.header, dtype=data.dtype)
+    _place(image, grid, template)
+    return image
 
 
-def _open(path: Path) -> tuple[Any, NiftiHeader]:
+def _open(path: Path, channels: bool) -> tuple[Any, NiftiHeader, int, tuple[int, ...]]:
+    """nibabel's image, the template, the number of values at a voxel, and the shape with all of them on an axis."""
     import nibabel as nib
 
     for part in files(path):
@@ -83,12 +128,20 @@ def _open(path: Path) -> tuple[Any, NiftiHeader]:
         image: Any = nib.load(path, mmap=False)
     _require_nifti_volume(path, image)
     file_shape = tuple(map(int, image.shape))
-    shape = checks.spatial_shape(path, file_shape)
-    checks.require_real(path, image.get_data_dtype())
+    coloured = _is_coloured(image)
+    shape, count = checks.layout(path, file_shape, per_voxel=3 if coloured else 1, channels=channels)
+    if coloured:
+        file_shape = (*file_shape, 3)
+    else:
+        checks.require_numbers(path, image.get_data_dtype(), count, channels=channels)
     affine = np.array(image.affine, float)
     affine[:3] *= _MM_PER_UNIT[_units(image.header)[0]]
     checks.require_usable_affine(path, affine)
-    return image, NiftiHeader(image.header, Grid(shape, affine))
+    return image, NiftiHeader(image.header, Grid(shape, affine)), count, file_shape
+
+
+def _is_coloured(image: Any) -> bool:
+    return {"R", "G", "B"} <= set(image.get_data_dtype().names or ())
 
 
 def _require_nifti_volume(path: Path, image: Any) -> None:
@@ -133,5 +186,7 @@ def _forget_stale_range(header: Any, data: np.ndarray) -> None:
     if low == high == 0:
         return
     finite = data[np.isfinite(data)]
+    if np.iscomplexobj(data):
+        finite = np.abs(finite)
     if finite.size and not (low <= finite.min() and finite.max() <= high):
         header["cal_min"] = header["cal_max"] = 0

@@ -11,7 +11,7 @@ from beltrami_cli.surface import Mesh
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
-    """Binary PLY with colours and the float property `value` at the vertices: faces, or edges for a curve."""
+    """Binary PLY with colours and the float property `value` (or `value_1` ...) at the vertices: faces or edges."""
     if mesh.cells.shape[1] == 3:
         write_with_trimesh(path, mesh)
     else:
@@ -21,8 +21,8 @@ def write_ply(path: Path, mesh: Mesh) -> None:
 def write_with_trimesh(path: Path, mesh: Mesh) -> None:
     """Triangles, vertices and faces in the order given.
 
-    .ply, binary, with RGBA and the float property `value` at the vertices; .obj and .glb with the values as colours;
-    .stl with the geometry alone.
+    .ply, binary, with RGBA and the float property `value` (or `value_1` ...) at the vertices; .obj and .glb with the
+    values as colours; .stl with the geometry alone.
     """
     import trimesh
 
@@ -30,7 +30,7 @@ def write_with_trimesh(path: Path, mesh: Mesh) -> None:
     colour, numbers = None, None
     if mesh.values is not None:
         colour = colours.rgb(mesh.values)
-        numbers = {"value": mesh.values.astype(np.float32)} if kind == "ply" else None
+        numbers = _numbers(mesh) if kind == "ply" else None
     with checks.writing(path):
         trimesh.Trimesh(
             mesh.vertices_ras_mm, mesh.cells, vertex_colors=colour, vertex_attributes=numbers, process=False
@@ -38,12 +38,11 @@ def write_with_trimesh(path: Path, mesh: Mesh) -> None:
 
 
 def write_vtk(path: Path, mesh: Mesh) -> None:
-    """Legacy binary VTK, float32: triangles or lines, and the array `value` at the points."""
+    """Legacy binary VTK, float32: triangles or lines, and the array `value` (or `value_1` ...) at the points."""
     import meshio
 
     cell_type = "triangle" if mesh.cells.shape[1] == 3 else "line"
-    values = {} if mesh.values is None else {"value": mesh.values.astype(np.float32)}
-    content = meshio.Mesh(mesh.vertices_ras_mm.astype(np.float32), [(cell_type, mesh.cells)], values)
+    content = meshio.Mesh(mesh.vertices_ras_mm.astype(np.float32), [(cell_type, mesh.cells)], _numbers(mesh))
     with checks.writing(path):
         content.write(path, file_format="vtk42")  # unlike version 5, every reader of VTK knows it
 
@@ -59,6 +58,11 @@ def write_obj_lines(path: Path, mesh: Mesh) -> None:
         path.write_text("\n".join(["# vertices in RAS mm", *vertices, *lines, ""]), encoding="ascii", newline="\n")
 
 
+def _numbers(mesh: Mesh) -> dict[str, np.ndarray]:
+    """float32 values by names without spaces, which neither PLY nor VTK can hold."""
+    return {name.replace(" ", "_"): column.astype(np.float32) for name, column in mesh.named_values().items()}
+
+
 def _write_ply_edges(path: Path, mesh: Mesh) -> None:
     """By hand: trimesh writes a path's edges without colours and values, meshio as faces of two corners."""
     table: list[tuple[str, str, str, np.ndarray]] = [
@@ -67,7 +71,7 @@ def _write_ply_edges(path: Path, mesh: Mesh) -> None:
     if mesh.values is not None:
         tints = colours.rgb(mesh.values)
         table += [(name, "uchar", "u1", tints[:, k]) for k, name in enumerate(("red", "green", "blue"))]
-        table.append(("value", "float", "<f4", mesh.values))
+        table += [(name, "float", "<f4", column) for name, column in _numbers(mesh).items()]
     vertices = np.empty(len(mesh.vertices_ras_mm), [(name, code) for name, _, code, _ in table])
     for name, _, _, column in table:
         vertices[name] = column

@@ -32,7 +32,7 @@ def transport(u, normal, distance, forward, backward, spacing, width, dt, out):
 
 @nb.njit(cache=True)
 def flood(u, forward, backward):
-    """Fill NaN entries of u (K, E) in place, ring by ring, each with the mean of its linked entries of the rings before.
+    """Fill NaN entries of u (K, E) in place, ring by ring, each with the mean of its linked entries of earlier rings.
 
     Entries of a bank without any known value stay NaN.
     """
@@ -69,8 +69,8 @@ def relax(u, free, forward, backward, spacing, tolerance, iterations):
     """Make u (K, E) float64 harmonic over links at the `free` entries (F,), the others fixed, in place.
 
     Conjugate gradients on the 7-point Laplacian of all channels as one system, so that turning two channels into each
-    other turns the result; from u as it stands, until the residual has fallen by `tolerance` or after `iterations`. Sums
-    run over blocks of fixed size, whatever the number of threads.
+    other turns the result; from u as it stands, until the residual has fallen by `tolerance` or after `iterations`.
+    Sums run over blocks of fixed size, whatever the number of threads.
     """
     channels = len(u)
     blocks = (len(free) + BLOCK - 1) // BLOCK

@@ -115,8 +115,8 @@ def cubic(u, size, origin, offset, forward, nodes, out):
 
     Every channel stays within the range of the cell's own nodes; or, where size (E,) holds |u| (else it is empty), the
     vector of all channels within their greatest length, which is the same however two channels are turned into each
-    other. `origin` and `offset` as for `stencil_origins`. Where the stencil is incomplete (-1) or holds a NaN, out keeps
-    its value.
+    other. `origin` and `offset` as for `stencil_origins`. Where the stencil is incomplete (-1) or holds a NaN, out
+    keeps its value.
     """
     f0, f1, f2 = forward[0], forward[1], forward[2]
     channels, queries = len(u), len(origin)
@@ -148,10 +148,10 @@ def cubic(u, size, origin, offset, forward, nodes, out):
 
 @nb.njit(cache=True, parallel=True)
 def linear(u, confidence, start, offset, forward, backward, least, total, mass):
-    """Add to total (K, Q) and mass (Q,) the trilinear sums of confidence times u (K, E) and of confidence (E,) at each query.
+    """Add the trilinear sums of confidence (E,) times u (K, E) to total (K, Q), and of confidence to mass (Q,).
 
-    Over the cell's corners that links reach and whose confidence is above 0; where their trilinear weights sum to no
-    more than `least`, nothing is added.
+    At each query, over the cell's corners that links reach and whose confidence is above 0; where their trilinear
+    weights sum to no more than `least`, nothing is added.
     """
     channels = len(u)
     for chunk in nb.prange((len(start) + BLOCK - 1) // BLOCK):

@@ -1,9 +1,9 @@
 """Fluxes of the Beltrami flow of several channels, coupled by the metric of the surface that they span together.
 
-With V = [v_1 ... v_K] the channels' tangential gradients and M = I_K + beta^2 V^T V their metric in Gram form, channel k
-has the flux sum_l C_kl v_l, C = sqrt(det M) M^-1, and the outer factor a = 1 / sqrt(det M). As V M^-1 = A^-1 V with the
-3 x 3 matrix A = I + beta^2 V V^T, of the same determinant, that is T v_k with one tensor T = sqrt(det A) P A^-1 P for all
-channels: none can push another out of its range. Of S = beta^2 V V^T: det A = 1 + tr S + tr adj S + det S, and
+With V = [v_1 ... v_K] the channels' tangential gradients and M = I_K + beta^2 V^T V their metric in Gram form, the flux
+of channel k is sum_l C_kl v_l, C = sqrt(det M) M^-1, and the outer factor a = 1 / sqrt(det M). As V M^-1 = A^-1 V with
+the 3 x 3 matrix A = I + beta^2 V V^T, of the same determinant, that is T v_k with one tensor T = sqrt(det A) P A^-1 P
+for all channels: none can push another out of its range. Of S = beta^2 V V^T: det A = 1 + tr S + tr adj S + det S, and
 adj A = (1 + tr S) I - S + adj S.
 
 Arrays as in `steps`; tensor: (6, E) T as 00, 11, 22, 01, 02, 12; outer: (E,) a; largest: (E,) its largest eigenvalue,
