@@ -115,12 +115,12 @@ class Stepper:
         source, left, taken, energy, squares = u, dt, 0, 0.0, 0.0
         while left > 0 or not taken:
             now, bound = self._fluxes(source, beta * self.unit)
-            parts = max(1, math.ceil(left / dt * bound - 1e-6)) if dt else 1
-            if not parts <= MOST_SUBSTEPS:  # NaN, too
+            if not bound <= MOST_SUBSTEPS:  # NaN, too
                 raise NumericsError(
                     f"a step at beta {beta:.4g} would have to be divided into {bound:.4g}: the channels' slopes are "
                     "far above 1/beta; give a smaller --beta"
                 )
+            parts = max(1, math.ceil(left / dt * bound - 1e-6)) if dt else 1
             squares = steps.diverge(
                 source, self.flux, self.band.backward, self.outer, self.flow.has_outer_factor, left / parts, out
             )

@@ -7,7 +7,7 @@ surface point, so that they are constant along normals. Noise is Gaussian, indep
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,8 @@ def torus(size: int = 64, *, noise: float = 40.0, seed: int = 0, map: str = "mix
     map: with theta around the axis and phi around the tube,
     `mixed`  90 + 50 cos 2phi where sin 2theta > 0, else 180 + 40 sin 3theta: smooth parts and borders;
     `pieces` 200 where sin 3theta sin 2phi > 0, else 60;
-    `smooth` 128 + 60 sin 2theta + 40 cos 3phi.
+    `smooth` 128 + 60 sin 2theta + 40 cos 3phi;
+    `angle`  degrees in 0..360, 2 theta + 40 sin phi, which wraps twice around the axis; so does its noise.
     """
     x, y, z = _centred(size, 3)
     ring = np.hypot(x, y) - 18 * size / 64
@@ -63,9 +64,12 @@ def torus(size: int = 64, *, noise: float = 40.0, seed: int = 0, map: str = "mix
         clean = np.where(np.sin(3 * theta) * np.sin(2 * phi) > 0, 200.0, 60.0)
     elif map == "smooth":
         clean = 128 + 60 * np.sin(2 * theta) + 40 * np.cos(3 * phi)
+    elif map == "angle":
+        clean = (np.rad2deg(2 * theta) + 40 * np.sin(phi)) % 360
     else:
-        raise RefusedError(f"map of the torus: found {map!r}, expected mixed, pieces or smooth")
-    return _phantom(psi, clean, noise, seed)
+        raise RefusedError(f"map of the torus: found {map!r}, expected mixed, pieces, smooth or angle")
+    made = _phantom(psi, clean, noise, seed)
+    return replace(made, noisy=made.noisy % np.float32(360)) if map == "angle" else made
 
 
 def sphere(size: int = 48, *, noise: float = 40.0, seed: int = 0) -> Phantom:

@@ -26,7 +26,7 @@ from beltrami_cli.progress import Phases
 from beltrami_cli.record import Plan, Ran, what_happened
 from beltrami_cli.sampling import surface_mesh
 from beltrami_cli.surface import Mesh
-from beltrami_cli.tuning import LEAST_VOXELS, Choice, Family, choose, decorrelated, discrepancy
+from beltrami_cli.tuning import LEAST_VOXELS, Choice, Family, can_hold_out, choose, decorrelated, discrepancy
 
 # eps of the flows l1 and tv as a share of the data's typical slope: so small that nearly every slope counts as an edge.
 EPS_SHARE = 0.1
@@ -162,7 +162,7 @@ class Solver:
                     stop=settings.stop == "auto",
                 )  # fmt: skip
             flow, fixed, steps = choice.flow, choice.beta, choice.iterations
-            self._doubt(choice, sample)
+            self._doubt(choice, sample, constant=not slope)
         elif fixed is None:
             fixed = 1 / slope if slope else 0.0
         if settings.stop == "decorrelation":
@@ -193,9 +193,11 @@ class Solver:
         if beta is not None or stop is not None or not self.iterations:
             return False
         why = None
-        if (sample.trust > 0).sum() < LEAST_VOXELS:
-            why = f"there are fewer than {LEAST_VOXELS} valid voxels, too few to hold some out"
-        elif self.settings.flow != "auto" and looks_correlated(self.band, sample.own, sample.course.kind):
+        if self.settings.flow == "auto":
+            return True
+        if len(can_hold_out(self.band, sample.trust)) < LEAST_VOXELS:
+            why = f"there are fewer than {LEAST_VOXELS} valid voxels beside the surface, too few to hold some out"
+        elif looks_correlated(self.band, sample.own, sample.course.kind):
             why = f"{CORRELATED}, so that held-out ones would be predicted from their own copies"
         if why:
             self.warnings.add(f"beta auto: {why}: beta is 1 / the data's median slope; give --beta or --edge")
@@ -213,7 +215,7 @@ class Solver:
             Family(Flow("phi", "perona-malik", settings.scheme), None),
         ]
 
-    def _doubt(self, choice: Choice, sample: Sample) -> None:
+    def _doubt(self, choice: Choice, sample: Sample, *, constant: bool) -> None:
         """Warn where held-out data are a poor judge."""
         way_out = "look at the result, or use --stop discrepancy with --noise-sigma S"
         if looks_correlated(self.band, sample.own, sample.course.kind):
@@ -221,7 +223,7 @@ class Solver:
                 f"automatic choice: {CORRELATED}: held-out ones are predicted from their own copies, and too little is "
                 f"smoothed; {way_out}"
             )
-        elif not choice.is_clear:
+        elif self.settings.stop == "auto" and not choice.is_clear and not constant:
             self.warnings.add(
                 "automatic choice: no run predicts the held-out voxels clearly better than the data as they are; "
                 + way_out

@@ -89,15 +89,17 @@ class Choice:
         ]
 
 
-def hold_out(band: Band, trust: np.ndarray, seed: int) -> np.ndarray:
-    """Entries (H,) of voxels near the surface whose data are held out; trust: (E,) weights, 0 where data are missing.
-
-    Raises DataError where too few voxels hold data.
-    """
+def can_hold_out(band: Band, trust: np.ndarray) -> np.ndarray:
+    """Entries (N,) of voxels near the surface of which some can be held out; trust: (E,) weights, 0 where missing."""
     voxels = np.abs(band.distance) / band.grid.used_spacing.max()
     inner = np.flatnonzero((trust > 0) & (voxels < SHELL[0]))
     shell = np.flatnonzero((trust > 0) & (voxels >= SHELL[0]) & (voxels < SHELL[1]))
-    valid = shell if len(shell) > len(inner) / 2 else inner  # data may end near the surface
+    return shell if len(shell) > len(inner) / 2 else inner  # data may end near the surface
+
+
+def hold_out(band: Band, trust: np.ndarray, seed: int) -> np.ndarray:
+    """Entries (H,) whose data are held out; raises DataError where too few voxels hold data."""
+    valid = can_hold_out(band, trust)
     count = round(HELD_OUT * len(valid))
     if count < LEAST_HELD:
         raise DataError(

@@ -28,7 +28,9 @@ from beltrami_cli.phantoms import Phantom, torus
 
 MAPS, SIGMAS = ("smooth", "pieces", "mixed"), (10, 20, 40)
 FLOWS = {"L2": Flow("l2"), "TV": Flow("tv"), "P-M": Flow("phi", "perona-malik"), "Beltr": Flow("beltrami")}
-STEEPNESS = 2.0 ** np.arange(-4, 4.1, 0.5)  # beta (for TV 1/eps) times the typical slope of the data
+# beta times the typical slope of the data, in steps of sqrt 2; for TV 1/eps, whose limit at large values is meant.
+USUAL, FLAT, STEEP = 2.0 ** np.arange(-4, 4.1, 0.5), np.zeros(1), 2.0 ** np.arange(-4, 8.1, 0.5)
+STEEPNESS = {"L2": FLAT, "TV": STEEP, "P-M": USUAL, "Beltr": USUAL}
 MOST = 3000  # iterations; three times as many as the tool may choose
 PAST = (1.6, 30)  # a curve has passed its best when it has gone on for this share of it, and so many more
 AUTOMATIC = {"Beltr": {"flow": "beltrami"}, "P-M": {"flow": "phi", "phi": "perona-malik"}, "auto": {"flow": "auto"}}
@@ -43,10 +45,6 @@ class Best:
     db: float
     steepness: float
     steps: int
-
-    @property
-    def is_at_end(self) -> bool:
-        return self.steepness == STEEPNESS[-1] or self.steps == MOST
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ class Case:
             return Best(max(curve), steepness, int(np.argmax(curve)))
 
         return {
-            name: max((best(flow, s) for s in ([0.0] if name == "L2" else STEEPNESS)), key=lambda b: b.db)
+            name: max((best(flow, steepness) for steepness in STEEPNESS[name]), key=lambda found: found.db)
             for name, flow in FLOWS.items()
         }
 
@@ -171,7 +169,7 @@ def main() -> None:
 
 
 def line(groups: list[list[str]]) -> str:
-    return " |".join("".join(f"{cell:>{9 if i == 2 else 7}}" for i, cell in enumerate(group)) for group in groups)
+    return " |".join("".join(f"{cell:>{9 if '/' in cell else 7}}" for cell in group) for group in groups)
 
 
 def summarise(rows: list[Row]) -> None:
@@ -194,7 +192,7 @@ def summarise(rows: list[Row]) -> None:
         print(f"{SCHEDULE} at {steps}: loss at most {max(loss):.2f} dB, median {np.median(loss):.2f}")
     for row in rows:
         for name, best in row.best.items():
-            if best.is_at_end:
+            if best.steps == MOST or best.steepness == STEEPNESS[name][-1] > 0:
                 print(f"{row.case.map} {row.case.sigma}: the best {name} lies at the end of what was searched")
 
 

@@ -62,7 +62,7 @@ def summary(phantom_name: str, run: str) -> dict[str, float]:
     options = dict(RUNS[run])
     spacing = options.pop("spacing", (1.0, 1.0, 1.0))
     if run == "weighted":
-        options["weights"] = made.clean
+        options["weights"] = 50 + made.clean
     result = denoise(
         made.levelset,
         data_of(made, run),

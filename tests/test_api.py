@@ -84,7 +84,7 @@ def test_observer_sees_every_iteration():
 
 
 def test_warnings_are_handed_back():
-    (line,) = denoise(ball() < 0, noisy()).warnings
+    (line,) = denoise(ball() < 0, noisy(), beta=0.1).warnings
     assert "two values only" in line
 
 

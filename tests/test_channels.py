@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import nibabel as nib
@@ -97,6 +98,17 @@ def test_a_nifti_header_keeps_its_frames(tmp_path):
     assert after.header["descrip"].tobytes().startswith(b"resting")
     assert np.array_equal(after.affine, nib.load(tmp_path / "v.nii.gz").affine)
     assert (mask.shape, mask.get_data_dtype()) == ((3, 4, 5), np.uint8)
+
+
+def test_frames_under_the_header_of_a_single_volume(tmp_path):
+    image = nib.Nifti1Image(FRAMES[..., 0], TWINS["oblique"].affine)
+    image.header.set_intent("z score")
+    image.header["pixdim"][4] = 0
+    image.to_filename(tmp_path / "psi.nii")
+    write_volume(tmp_path / "v.nii", read_volume(tmp_path / "psi.nii").with_data(FRAMES))
+    header = nib.load(tmp_path / "v.nii").header
+    assert (header.get_zooms()[3], header.get_intent()[0]) == (1, "none")
+    assert np.array_equal(header.get_sform(), image.header.get_sform())
 
 
 def test_frames_of_metaimage_stay_frames(tmp_path):
@@ -234,6 +246,20 @@ def test_a_nifti_series_keeps_its_header(tmp_path, suffix, stored):
     assert after.header.get_zooms()[3] == pytest.approx(2.2)
     assert np.array_equal(after.affine, image.affine)
     assert (len(after.header.extensions), float(after.header["cal_max"])) == (1, 0)
+
+
+@pytest.mark.parametrize(("source", "target"), [("a.nii.gz", "b.nii.gz"), ("a.mgz", "b.npy"), ("a.nii", "b.hdr")])
+def test_memory_does_not_grow_with_the_frames(tmp_path, source, target):
+    frames = np.random.default_rng(0).integers(0, 1000, (32, 32, 20, 60)).astype(np.float32)
+    write_volume(tmp_path / source, Volume(frames, Grid.from_spacing((32, 32, 20))))
+    write_series(tmp_path / f"first_{target}", open_series(tmp_path / source), open_series(tmp_path / source))
+    tracemalloc.start()
+    series = open_series(tmp_path / source)
+    write_series(tmp_path / target, series, series)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * frames[..., 0].nbytes
+    assert np.array_equal(read_volume(tmp_path / target, channels=True).data, frames)
 
 
 def test_a_series_on_another_grid(tmp_path):

@@ -14,4 +14,4 @@ def test_config_is_valid(path: Path) -> None:
     job = config.make_job(config.read_config(path))
     assert job.levelset is not None
     assert job.levelset.is_relative_to(path.parent)
-    assert job.volume.name.startswith(("torus_beta", "curve", "portrait", "map_denoised"))
+    assert job.volume.name.startswith(("torus_beta", "curve", "portrait", "map_denoised", "angle_denoised"))

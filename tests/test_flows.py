@@ -65,21 +65,24 @@ def test_phi_charbonnier_is_tv(scheme):
     assert np.array_equal(tv, phi, equal_nan=True)
 
 
-def oblique_plane_wave(size=40, wavelength=25.0):
-    """An oblique plane through a cube, u = 2p + sin(k q) for two directions p, q along it, and v's analytic terms.
-
-    |grad u| is nowhere below 2: no critical point. Returns (band, u (E,), |v| (E,), dv_q/dq (E,), core (E,) bool).
-    """
+def oblique_plane(size=40):
+    """An oblique plane through a cube: its band, p and q (E,) in mm along it, core (E,) bool, far from rims."""
     normal, p, q = (np.array(a) / np.linalg.norm(a) for a in ((1, 2, 3), (3, 0, -1), (1, -5, 3)))
     x = np.indices((size,) * 3) - (size - 1) / 2 + 0.2
     band = band_of(np.tensordot(normal, x, 1))
-    k = 2 * np.pi / wavelength
-    across = band.gather(np.tensordot(q, x, 1))
-    u = 2 * band.gather(np.tensordot(p, x, 1)) + np.sin(k * across) / k
-    slope_q = np.cos(k * across)
     distance_to_faces = np.minimum(x, -x).min(0) + size / 2
     core = (band.gather(distance_to_faces) > 5) & (np.abs(band.distance) < 2)
-    return band, u, np.hypot(2, slope_q), -k * np.sin(k * across), core
+    return band, band.gather(np.tensordot(p, x, 1)), band.gather(np.tensordot(q, x, 1)), core
+
+
+def oblique_plane_wave(size=40, wavelength=25.0):
+    """u = 2p + sin(k q) on an oblique plane, and v's analytic terms; |grad u| is nowhere below 2: no critical point.
+
+    Returns (band, u (E,), |v| (E,), dv_q/dq (E,), core (E,) bool).
+    """
+    band, p, q, core = oblique_plane(size)
+    k = 2 * np.pi / wavelength
+    return band, 2 * p + np.sin(k * q) / k, np.hypot(2, np.cos(k * q)), -k * np.sin(k * q), core
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

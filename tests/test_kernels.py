@@ -162,15 +162,14 @@ def test_metric_of_one_channel_is_the_shared_diffusivity(scale):
     u, normal, forward, backward, _ = random_place("surface", 1)
     arguments = (scale * u, normal, forward, backward, SPACINGS[1])
     shared, coupled = (take_step("paper", *arguments, law, True, 0.8, 0.1) for law in (steps.R, None))
-    print('K1', np.abs(coupled[0] - shared[0]).max()/scale)
     assert np.abs(coupled[0] - shared[0]).max() < 1e-12 * scale
-    assert coupled[1:] == pytest.approx(shared[1:], rel=1e-12)
+    assert coupled[1:] == pytest.approx(shared[1:], rel=1e-9)
 
 
-@pytest.mark.parametrize("scales", [(1, 1e4), (1e4, 1e4), (1, 1e3, 1e3), (1, 1, 1e3, 1e4, 1e4)])
+@pytest.mark.parametrize("scales", [(1, 1e4), (5, 5, 1e4), (1e4, 1e4), (1, 1e3, 1e3), (1, 1, 1e3, 1e4, 1e4)])
 @pytest.mark.parametrize("place", PLACES)
 def test_metric_at_slopes_far_above_the_edge(place, scales):
-    """Its smallest numbers come out of the largest ones: as exactly as by the logarithms of singular values."""
+    """Its smallest numbers come out of the largest ones: compared with what V's singular values give."""
     u, normal, forward, backward, tangents = random_place(place, len(scales))
     u *= np.array(scales)[:, None]
     v, p = central_slopes(u, normal, forward, backward, SPACINGS[1])
@@ -180,8 +179,7 @@ def test_metric_at_slopes_far_above_the_edge(place, scales):
     size = np.sqrt((1 + s**2).prod(1))
     exact = np.einsum("abm,mbk,mk,mck,cdm->adm", p, left, size[:, None] / (1 + s**2), left, p)
     assert np.allclose(a, 1 / size, rtol=1e-6)
-    print('far', place, scales, (np.abs(tensor - exact).max((0, 1)) / np.abs(exact).max((0, 1))).max())
-    assert np.all(np.abs(tensor - exact).max((0, 1)) < 1e-5 * np.abs(exact).max((0, 1)))
+    assert np.all(np.abs(tensor - exact).max((0, 1)) < 1e-6 * np.abs(exact).max((0, 1)))
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -203,7 +201,7 @@ def test_largest_eigenvalue_of_the_metric(channels, place):
 @pytest.mark.parametrize("channels", [2, 3, 5])
 @pytest.mark.parametrize("place", PLACES)
 def test_metric_bounds_the_step(place, channels, name):
-    """At least the largest a_i lambda_max(T_i + T_j) / 2 over the faces, and stable: the fastest decay is below 2 / dt."""
+    """At least the largest a_i lambda_max(T_i + T_j) / 2 over the faces; dt times the fastest decay is <= 2."""
     u, normal, forward, backward, tangents = random_place(place, channels)
     u[0] *= 30
     rest = (forward, backward, SPACINGS[1])
@@ -211,7 +209,6 @@ def test_metric_bounds_the_step(place, channels, name):
     if PLACES[place][0][2] == 1:
         tensor[2] = tensor[:, 2] = 0
     assert reference.largest_over_faces(tensor, a, forward) <= bound * (1 + 1e-12)
-    print('bnd', place, channels, name, bound)
     assert bound > 1.5 if tangents > 1 else bound <= 1
     axes = np.array(SPACINGS[1])[np.array(PLACES[place][0]) > 1]
     dt = 1 / (2 * (1 / axes**2).sum()) / max(1, bound)

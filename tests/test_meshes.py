@@ -180,9 +180,9 @@ def test_numbers_of_several_values(tmp_path, suffix, cells):
 
 def test_colours_of_several_values():
     grey = [128, 128, 128]
-    true = np.array([[0, 127.6, 255], [np.nan, 0, 0], [1, 2, 3]])
-    assert rgb(true).tolist() == [[0, 128, 255], grey, [1, 2, 3]]
-    signed = true - 100
+    true = np.array([[-0.4, 127.6, 270], [np.nan, 0, 0], [3, 2, 3]])
+    assert rgb(true).tolist() == [[0, 128, 255], grey, [3, 2, 3]]
+    signed = true - 200
     assert np.array_equal(rgb(signed), rgb(np.linalg.norm(signed, axis=1)))
     assert np.array_equal(rgb(SEVERAL[:, :2]), rgb(np.sqrt(5) * VALUES))
     assert rgb(np.full((2, 3), np.nan)).tolist() == [grey, grey]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from test_band import band_of
 
 from beltrami_cli import denoise, phantoms
-from beltrami_cli.extension import EXTENSIONS, Reextension, extend
+from beltrami_cli.extension import EXTENSIONS, Reextension, extend, own_samples
 from beltrami_cli.flows import FLOWS, SCHEMES, Flow, Stepper
 from beltrami_cli.sampling import surface_mesh
 
@@ -221,3 +221,38 @@ def test_constants_are_fixed_whatever_the_kind(options):
     got = run(values, FOLD.levelset, beta=0.05, **options)
     apart = np.abs(got - values)
     assert np.nanmax(apart / np.maximum(np.abs(values), 1)) < 1e-5 and np.isfinite(got).any()
+
+
+# --- channels: coupled, and yet each on its own scale -----------------------------------------------------------------
+
+
+@few
+@given(seed=seeds, beta=st.floats(0.001, 3), scales=st.sampled_from([(1, 1), (1, 10, 100), (0.1, 1, 10, 1, 0.1)]))
+def test_coupled_channels_stay_in_their_ranges(seed, beta, scales):
+    data = np.random.default_rng(seed).normal(5, scales, (24, 24, 24, len(scales)))
+    got = run(data, FOLD.levelset, kind="vector", beta=beta, iterations=5)
+    margin = 0.01 * np.ptp(data, axis=(0, 1, 2))
+    assert np.all(np.nanmin(got, (0, 1, 2)) >= data.min((0, 1, 2)) - margin)
+    assert np.all(np.nanmax(got, (0, 1, 2)) <= data.max((0, 1, 2)) + margin)
+
+
+@few
+@given(seed=seeds, scheme=schemes, beta=st.floats(0, 3), by=st.floats(0, 2 * np.pi))
+def test_a_complex_field_turned_gives_the_result_turned(seed, scheme, beta, by):
+    """Without re-extension, which keeps the real and the imaginary part in a range each."""
+    rng = np.random.default_rng(seed)
+    field = rng.normal(3, 1, FOLD.levelset.shape) + 1j * rng.normal(0, 1, FOLD.levelset.shape)
+    options = {"kind": "vector", "beta": beta, "scheme": scheme, "extend_every": 0, "precision": "float64"}
+    first, second = (run(x, FOLD.levelset, **options) for x in (field, field * np.exp(1j * by)))
+    assert np.nanmax(np.abs(first * np.exp(1j * by) - second)) < 1e-10
+    assert np.nanstd(first) > 0.05
+
+
+def test_without_extension_every_voxel_keeps_its_own():
+    """Those midway between two banks too, which feed neither where data are carried to the surface."""
+    psi, data = phantoms.sulcus(24, gap=1.5, noise=0).levelset, random_data(4)
+    band = band_of(psi)
+    own, every = (own_samples(band, band.gather(data)[None], every=every)[0, band.primary] for every in (False, True))
+    assert np.isnan(own).sum() > 100 and np.array_equal(every, band.gather(data)[band.primary])
+    kept = run(data, psi, extension="none", iterations=0)
+    assert np.array_equal(kept[np.abs(psi) < 3], data[np.abs(psi) < 3])

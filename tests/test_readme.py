@@ -42,7 +42,7 @@ def test_commands_run(page, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_python_runs(page):
-    names = {"levelset": ball(), "data": noisy(), "affine": np.eye(4)}
+    names = {"levelset": ball(), "data": noisy(), "r2": np.ones((16, 16, 16)), "affine": np.eye(4)}
     for block in blocks(page, "python"):
         exec(compile(block, page.name, "exec"), names)
 

@@ -11,7 +11,7 @@ from beltrami_cli.cli.common import Command, overwrite_option, say
 from beltrami_cli.errors import RefusedError
 
 NAMES = ("torus", "sphere", "plane", "curve", "portrait", "sulcus")
-MAPS = {"torus": ("mixed", "pieces", "smooth"), "portrait": ("grey", "rgb")}
+MAPS = {"torus": ("mixed", "pieces", "smooth", "angle"), "portrait": ("grey", "rgb")}
 
 
 @click.command(cls=Command)
@@ -27,7 +27,7 @@ MAPS = {"torus": ("mixed", "pieces", "smooth"), "portrait": ("grey", "rgb")}
     "--map",
     "painting",
     type=click.Choice([map for maps in MAPS.values() for map in maps]),
-    help="Data on the torus (mixed, pieces, smooth) or the portrait (grey, rgb).",
+    help="Data on the torus (mixed, pieces, smooth, angle) or the portrait (grey, rgb).",
 )
 @click.option("--gap", type=float, metavar="VOXELS", help="Between the banks of the sulcus.")
 @overwrite_option

@@ -128,8 +128,9 @@ def open_series(
 ) -> Series:
     """The frames or channels of a file, read as `dtype` one at a time; a single volume is a series of one.
 
-    NIfTI and MGH stay open and NPY is mapped, so that one frame is in memory; MetaImage, PNG and coloured NIfTI are
-    read whole at the first frame. Arguments and errors as `read_volume` with `channels`; complex numbers are refused.
+    NIfTI and MGH stay open and NPY is mapped, so that one frame is in memory (of NPY in C order, where a frame touches
+    every page, what the system keeps of the file); MetaImage, PNG and coloured NIfTI are read whole at the first frame.
+    Arguments and errors as `read_volume` with `channels`; complex numbers are refused.
     """
     found = _look(path, spacing, dtype, True, plane)
     if found.is_complex:

@@ -21,15 +21,16 @@ _PERCENTILES = (2.0, 98.0)
 def rgb(values: np.ndarray) -> np.ndarray:
     """(V, 3) uint8 colours of values (V,) or (V, K); grey where they are not finite.
 
-    Three channels that lie within 0 to 255, and reach beyond 1, are colours already. Of other channels the magnitude is
-    shown. A single value runs through the map from its 2nd to its 98th percentile.
+    Three channels whose means lie from 1 to 255 are colours already; what noise has driven out of 0 to 255 is clipped.
+    Of other channels the magnitude is shown. A single value runs through the map from its 2nd to its 98th percentile.
     """
     if values.ndim == 1:
         return _mapped(values)
     known = np.isfinite(values).all(1)
-    if values.shape[1] == 3 and known.any() and values[known].min() >= 0 and 1 < values[known].max() <= 255:
+    means = values[known].mean(0, dtype=float) if known.any() else np.zeros(values.shape[1])
+    if len(means) == 3 and means.min() >= 1 and means.max() <= 255:
         colours = np.full(values.shape, _MISSING, np.uint8)
-        colours[known] = np.rint(values[known])
+        colours[known] = np.rint(np.clip(values[known], 0, 255))
         return colours
     return _mapped(np.linalg.norm(values, axis=1))
 

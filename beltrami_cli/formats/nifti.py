@@ -112,6 +112,10 @@ def _image(path: Path, data: np.ndarray, grid: Grid, template: Any) -> Any:
         (True, True): nib.Nifti2Pair,
     }[pair, version_2]
     image = image_class(data, None, None if template is None else template.header, dtype=data.dtype)
+    if template is not None and template.header.get_data_shape()[3:] != data.shape[3:]:
+        # A mask of frames, colours on an axis: the template's step from frame to frame and its meaning are not theirs.
+        image.header["pixdim"][4:] = 1
+        image.header.set_intent("none")
     _place(image, grid, template)
     return image
 

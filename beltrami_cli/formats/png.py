@@ -24,7 +24,7 @@ def read(path: Path, dtype: DTypeLike, *, channels: bool = False) -> Volume:
     """
     import SimpleITK as sitk
 
-    if path.read_bytes()[_COLOUR_TYPE : _COLOUR_TYPE + 1] == _GREY_WITH_ALPHA:
+    if _pixel_kind(path) == _GREY_WITH_ALPHA:
         raise RefusedError(
             f"{path}: expected a grey or coloured picture; found grey with transparency; save it without"
         )
@@ -53,3 +53,9 @@ def open_series(path: Path, dtype: DTypeLike, *, channels: bool = True) -> Serie
     """The colours one by one; the whole picture is read. Raises as `read`."""
     picture = read(path, dtype, channels=channels)
     return Series(picture.grid, picture.channels, picture.file_shape, None, frames_of(lambda: picture))
+
+
+def _pixel_kind(path: Path) -> bytes:
+    with path.open("rb") as file:
+        file.seek(_COLOUR_TYPE)
+        return file.read(1)

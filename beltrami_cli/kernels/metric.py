@@ -17,8 +17,6 @@ import numpy as np
 
 from beltrami_cli.kernels import BLOCK, total
 
-ROUNDING = 1e-13  # of differences between products of the entries of S, relative to powers of its trace
-
 
 @nb.njit(cache=True)
 def couple(v, b2, normal, m, tangents, tensor, outer, largest):
@@ -34,10 +32,12 @@ def couple(v, b2, normal, m, tangents, tensor, outer, largest):
     trace = s00 + s11 + s22
     a00, a11, a22 = s11 * s22 - s12 * s12, s00 * s22 - s02 * s02, s00 * s11 - s01 * s01
     a01, a02, a12 = s02 * s12 - s01 * s22, s01 * s12 - s02 * s11, s01 * s02 - s00 * s12
-    second, third = a00 + a11 + a22, s00 * a00 + s01 * a01 + s02 * a02
-    second = second if second > ROUNDING * trace**2 else 0.0
-    third = third if third > ROUNDING * trace**3 else 0.0
-    size = np.sqrt(1 + trace + second + third)
+    second = a00 + a11 + a22
+    # det A by its pivots, none below 1: the sum above would lose det S in the rounding of (tr S)^3.
+    first = 1 + s00
+    middle = max(1 + s11 - s01 * s01 / first, 1.0)
+    across = s12 - s01 * s02 / first
+    size = np.sqrt(first * middle * max(1 + s22 - s02 * s02 / first - across * across / middle, 1.0))
     n0, n1, n2 = float(normal[0, m]), float(normal[1, m]), float(normal[2, m])
     # On a surface adj S lies along the normal, which P removes; without one P = I.
     rest = 0.0 if n0 * n0 + n1 * n1 + n2 * n2 > 0 else 1.0
