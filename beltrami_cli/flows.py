@@ -57,6 +57,11 @@ class Flow:
         return steps.ONE if self.name == "l2" else steps.R
 
     @property
+    def has_beta(self) -> bool:
+        """True where a person gives beta; `l1` and `tv` take eps in its place, `l2` nothing."""
+        return self.name in ("beltrami", "phi")
+
+    @property
     def has_outer_factor(self) -> bool:
         """True where a = r: such a flow does not keep the mean."""
         return self.name in ("beltrami", "l1")
@@ -147,8 +152,8 @@ class Stepper:
 def typical_slope(band: Band, u: np.ndarray, known: np.ndarray) -> float:
     """Median of |P grad u| over the entries where data were known, all channels together; 0 for constant data.
 
-    u: (K, E), known: (E,) bool; per mm, in the units of u. With noisy data this is the slope of the noise. Of a large
-    band a regular sample is looked at.
+    u: (K, E), known: (E,) bool; per mm, in the units of u. With noisy data this is the slope of the noise. Where more
+    than half is flat, as in a map of few patches, it is the mean. Of a large band a regular sample is looked at.
     """
     entries = np.flatnonzero(known)
     entries = entries[:: 1 + len(entries) // SLOPE_SAMPLES]
@@ -156,4 +161,5 @@ def typical_slope(band: Band, u: np.ndarray, known: np.ndarray) -> float:
     gradient = np.stack(differences) / (2 * band.grid.spacing[:, None, None])
     normal = band.normal[:, None, entries]
     gradient -= (gradient * normal).sum(0) * normal
-    return float(np.median(np.sqrt((gradient**2).sum((0, 1)))))
+    slope = np.sqrt((gradient**2).sum((0, 1)))
+    return float(np.median(slope) or slope.mean())

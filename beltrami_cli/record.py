@@ -113,13 +113,12 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
 def _used(settings: Settings, band: Band, plan: Plan, evolution: Evolution, kind: Kind) -> dict[str, Any]:
     """Every parameter as used, defaults and choices included."""
     flow, schedule = plan.flow, plan.schedule
-    has_beta = flow.name in ("beltrami", "phi")
     one = len(set(schedule.beta.tolist())) == 1
     return {
         **asdict(settings),
         "flow": flow.name,
         "phi": flow.phi if flow.name == "phi" else None,
-        "beta": (float(schedule.beta[0]) if one else str(settings.beta)) if has_beta else None,
+        "beta": (float(schedule.beta[0]) if one else str(settings.beta)) if flow.has_beta else None,
         "eps": 1 / schedule.beta[0] if flow.name in ("l1", "tv") and schedule.beta.any() else None,
         "band": band.half_width,
         "dt": schedule.dt,
@@ -133,7 +132,7 @@ def _chosen(choice: Choice, kind: Kind) -> dict[str, Any]:
     return {
         "flow": choice.flow.name,
         "phi": choice.flow.phi if choice.flow.name == "phi" else None,
-        "beta": choice.beta,
+        "beta": choice.beta if choice.flow.has_beta else None,
         "iterations": choice.iterations,
         "held_out_voxels": choice.held_out,
         "gain_standard_errors": choice.gain,

@@ -155,17 +155,19 @@ class Solver:
         steps, ends_by, choice = self.iterations, self.ends_by, None
         if isinstance(fixed, np.ndarray):  # a schedule
             return Plan(flow, Schedule(fixed, course.dt, ends_by), slope, noise, None)
-        if self._chooses(fixed, sample):
+        if not slope and settings.stop is not None:  # constant data: nothing to choose, and nothing to flow
+            steps = 0
+        elif slope and self._chooses(fixed, sample):
             with self.phases("choose"):
                 choice = choose(
                     course, sample.own, sample.trust, self._families(fixed, slope), slope, steps, settings.seed,
                     stop=settings.stop == "auto",
                 )  # fmt: skip
             flow, fixed, steps = choice.flow, choice.beta, choice.iterations
-            self._doubt(choice, sample, constant=not slope)
+            self._doubt(choice, sample)
         elif fixed is None:
             fixed = 1 / slope if slope else 0.0
-        if settings.stop == "decorrelation":
+        if settings.stop == "decorrelation" and steps:
             with self.phases("choose"):
                 steps = decorrelated(course, start, flow, fixed, steps)
         return Plan(flow, Schedule(np.full(steps, fixed), course.dt, ends_by), slope, noise, choice)
@@ -215,7 +217,7 @@ class Solver:
             Family(Flow("phi", "perona-malik", settings.scheme), None),
         ]
 
-    def _doubt(self, choice: Choice, sample: Sample, *, constant: bool) -> None:
+    def _doubt(self, choice: Choice, sample: Sample) -> None:
         """Warn where held-out data are a poor judge."""
         way_out = "look at the result, or use --stop discrepancy with --noise-sigma S"
         if looks_correlated(self.band, sample.own, sample.course.kind):
@@ -223,7 +225,7 @@ class Solver:
                 f"automatic choice: {CORRELATED}: held-out ones are predicted from their own copies, and too little is "
                 f"smoothed; {way_out}"
             )
-        elif self.settings.stop == "auto" and not choice.is_clear and not constant:
+        elif self.settings.stop == "auto" and not choice.is_clear:
             self.warnings.add(
                 "automatic choice: no run predicts the held-out voxels clearly better than the data as they are; "
                 + way_out
@@ -234,7 +236,7 @@ class Solver:
     def _run(self, data: np.ndarray, sample: Sample, plan: Plan, observer: Observer | None) -> Result:
         settings, band, course, start = self.settings, self.band, sample.course, sample.start
         stop = None
-        if settings.stop == "discrepancy":
+        if settings.stop == "discrepancy" and plan.schedule.iterations:
             sigma = settings.noise_sigma or float(np.sqrt(np.mean(plan.noise**2)))
             if not sigma > 0:
                 raise DataError("stop discrepancy: the noise cannot be estimated from these data; give --noise-sigma S")

@@ -79,7 +79,7 @@ class Choice:
             {
                 "flow": c.flow.name,
                 "phi": c.flow.phi if c.flow.name == "phi" else None,
-                "beta": c.beta,
+                "beta": c.beta if c.flow.has_beta else None,
                 "iterations": c.iterations,
                 "error": float(np.sqrt(c.error)),
                 "error_at_start": float(np.sqrt(c.errors[0])),
@@ -150,8 +150,8 @@ def choose(
 
     curves: list[Curve] = []
     for family in families:
-        if family.beta is not None or not slope:
-            curve(family.flow, family.beta or 0.0)
+        if family.beta is not None:
+            curve(family.flow, family.beta)
         else:
             search(lambda x, flow=family.flow: curve(flow, 2.0**x / slope).error)  # type: ignore[misc]
     best = min(curves, key=lambda c: c.error)

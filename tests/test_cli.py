@@ -86,10 +86,10 @@ def test_completion_script(shell):
 # What is written
 
 
-def test_summary_is_two_lines(scene, tmp_path):
+def test_summary_is_three_lines(scene, tmp_path):
     levelset, data, out = scene
     run = done("denoise", levelset, data, "-o", out)
-    first, second = run.out.splitlines()
+    first, second, third = run.out.splitlines()
     names = [tmp_path / f"out{suffix}" for suffix in (".nii.gz", ".surf.gii", ".func.gii", ".json")]
     assert first == f"wrote {', '.join(map(str, names))}"
     used = record(tmp_path / "out.json")
@@ -97,6 +97,7 @@ def test_summary_is_two_lines(scene, tmp_path):
     assert "20 iterations" in second
     assert "stopped by iterations" in second
     assert second.endswith(" s")
+    assert third == f"chosen by held-out data: beltrami, beta {used['Choice']['beta']:.4g}, 20 iterations"
     assert 9 < used["Removed"]["rms"] < 11  # of noise 10
     assert all(name.exists() for name in names)
 
@@ -144,7 +145,7 @@ def test_quiet_is_silent_and_verbose_says_more(scene):
     assert run.out == ""
     run = beltrami("denoise", levelset, data, "-o", out, "-v", "--overwrite")
     assert run.code == 0
-    assert len(run.out.splitlines()) == 2
+    assert len(run.out.splitlines()) == 3
     assert "486 vertices" in run.err
     assert "peak memory" in run.err
 
@@ -277,8 +278,8 @@ def test_how_long(scene, tmp_path, given, iterations, dt, reason):
         ("--flow beltrami", "--flow l2"),
         ("--flow beltrami", "--flow l1"),
         ("--flow l1", "--flow tv"),
-        ("--flow phi", "--flow phi --phi charbonnier"),
-        ("--flow phi --phi geman-mcclure", "--flow phi --phi weickert"),
+        ("--flow phi --beta 0.1", "--flow phi --phi charbonnier --beta 0.1"),
+        ("--flow phi --phi geman-mcclure --edge 10", "--flow phi --phi weickert --edge 10"),
         ("--scheme symmetric", "--scheme paper"),
         ("--beta 0.01", "--beta 1"),
         ("--flow l1 --eps 1", "--flow l1 --eps 10"),
@@ -569,7 +570,7 @@ def test_a_bug_is_one_line_too(scene, monkeypatch):
 
 def test_process_without_a_word_too_many(scene, tmp_path):
     levelset, data, out = scene
-    run = process("denoise", levelset, data, "-o", out)
+    run = process("denoise", levelset, data, "-o", out, "--beta", "0.1")
     assert (run.returncode, run.stderr, len(run.stdout.splitlines())) == (0, "", 2)
     run = process("denoise", levelset, tmp_path / "nothing.nii.gz", "-o", out)
     assert (run.returncode, run.stdout, len(run.stderr.splitlines())) == (2, "", 1)

@@ -221,7 +221,7 @@ def test_verbose_prints_the_table_of_the_choice(scene, monkeypatch):
         {"flow": "phi", "phi": "perona-malik", "beta": 0.5, "iterations": 9, "error": 11.0},
     ]
     record = {**RECORD, "Choice": {**table[1], "table": table}}
-    monkeypatch.setattr(pipeline, "run", lambda *_, **__: pipeline.Result(np.zeros(1), None, record, ()))
+    monkeypatch.setattr(pipeline, "run", lambda *_, **__: pipeline.Result(np.zeros(1), None, np.zeros(1), record, ()))
     levelset, data, out = scene
     run = beltrami("denoise", levelset, data, "-o", out, "-v")
     assert run.code == 0, run.err

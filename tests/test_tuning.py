@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from beltrami_cli import Result, denoise
 from beltrami_cli.band import Band, build_band
+from beltrami_cli.config import STOPS
 from beltrami_cli.course import Course
 from beltrami_cli.errors import DataError
 from beltrami_cli.evolve import Schedule
@@ -219,7 +220,7 @@ def test_given_beta_and_flow_are_not_searched():
     for flow, options in (("l2", {}), ("tv", {"eps": 5.0}), ("phi", {"beta": 0.1}), ("beltrami", {"edge": 10.0})):
         (row,) = denoise(made.levelset, made.noisy, flow=flow, stop="auto", **options).record["Choice"]["table"]
         assert row["flow"] == flow
-        assert row["beta"] == {"l2": 0, "tv": 0.2}.get(flow, 0.1)
+        assert row["beta"] == (0.1 if flow in ("phi", "beltrami") else None)
 
 
 def test_seed_decides():
@@ -322,10 +323,11 @@ def test_too_few_voxels():
         denoise(psi, few, stop="auto")
 
 
-@pytest.mark.parametrize("options", [{}, {"stop": "auto"}, {"flow": "auto"}, {"flow": "phi"}])
+@pytest.mark.parametrize("options", [{}, *({"stop": stop} for stop in STOPS[:2]), {"flow": "auto"}, {"flow": "phi"}])
 @pytest.mark.parametrize("value", [0.0, 7.0, -1e6])
 def test_constant_data_have_nothing_to_choose(value, options):
     psi = ball()
     result = denoise(psi, np.full(psi.shape, value, np.float32), **options)
-    near = np.isfinite(result.data)
-    assert near.any() and np.all(result.data[near] == value)
+    seen = np.isfinite(result.data)
+    assert seen.any() and np.all(result.data[seen] == value)
+    assert result.warnings == () and result.record["Choice"] is None
