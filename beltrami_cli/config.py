@@ -252,6 +252,11 @@ class Settings:
                 f"beta: found {self.beta} with the stop {self.stop}; a schedule runs over a known number of "
                 "iterations: give one beta, or --iterations in place of --stop"
             )
+        if self.stop == "discrepancy" and self.flow == "auto":
+            raise RefusedError(
+                "stop: discrepancy compares input and output, and cannot tell which flow is best; found the flow auto; "
+                "name the flow, or use --stop auto"
+            )
         if self.stop == "decorrelation" and self.flow not in ("l2", "tv", "phi"):
             raise RefusedError(
                 f"stop: decorrelation is for flows that keep the mean, l2, tv and phi; found the flow {self.flow}; "

@@ -33,11 +33,11 @@ class Course:
 
     @cached_property
     def reextension(self) -> Reextension | None:
-        return Reextension(self.band, turns=self.kind.is_circular) if self.extend_every else None
+        return Reextension(self.band, turns=self.kind.turns) if self.extend_every else None
 
     def start(self, own: np.ndarray, trust: np.ndarray) -> Extended:
         """Start values from own samples (K, E) of weights `trust` (E,); raises as `extend`."""
-        return extend(self.band, own, trust, self.extension, depth=self.depth, turns=self.kind.is_circular)
+        return extend(self.band, own, trust, self.extension, depth=self.depth, turns=self.kind.turns)
 
     def run(
         self,

@@ -60,7 +60,7 @@ def extend(
     `at_closest_points`), "pde" (U_t + sign(Psi) grad U . grad Psi = 0, Sec. 2.1) or "none" (each voxel keeps its own
     value; sheets other than the nearest take the closest point's). Holes are then filled from the band around them.
     depth: (A, B) in mm along the normal, for "closest-point": data are averaged from A to B.
-    turns: the channels are cos and sin of an angle; nothing may depend on where that is 0.
+    turns: the channels are cos and sin of an angle, or a complex number; nothing may depend on where its phase is 0.
     Raises DataError where no entry is reached by valid data.
     """
     own = np.where(confidence > 0, own, np.nan)
@@ -147,7 +147,7 @@ def fill(band: Band, values: np.ndarray, known: np.ndarray, *, turns: bool = Fal
     """Fill unknown entries of values (K, E) in place with the function harmonic in the band that meets the known ones.
 
     Conjugate gradients on the Laplacian over the band's links, started from a ring-by-ring flood; no value leaves the
-    range of the known ones (no angle's vector, with `turns`, their length). Banks without any known value stay NaN.
+    range of the known ones (with `turns`, no vector of channels their length). Banks without any known value stay NaN.
     """
     kernels.flood(values, band.forward, band.backward)
     free = np.flatnonzero(~known & ~np.isnan(values[0])).astype(np.int32)
@@ -155,7 +155,8 @@ def fill(band: Band, values: np.ndarray, known: np.ndarray, *, turns: bool = Fal
     kernels.relax(u, free, band.forward, band.backward, band.grid.spacing, FILL_TOLERANCE, FILL_ITERATIONS)
     inside = u[:, free]
     if turns:
-        inside /= np.maximum(np.sqrt((inside**2).sum(0)), 1)
+        longest = np.sqrt((values[:, known].astype(float) ** 2).sum(0).max())
+        inside *= np.minimum(1, longest / np.maximum(np.sqrt((inside**2).sum(0)), 1e-30))
     else:
         inside = np.clip(inside, values[:, known].min(1, keepdims=True), values[:, known].max(1, keepdims=True))
     values[:, free] = inside
@@ -164,7 +165,7 @@ def fill(band: Band, values: np.ndarray, known: np.ndarray, *, turns: bool = Fal
 class Reextension:
     """Makes values constant along normals again: the local cubic at each entry's closest point, on its own sheet.
 
-    turns: the channels are cos and sin of an angle, whose overshoot is cut in length, not in each channel.
+    turns: the channels are cos and sin, or a complex number, whose overshoot is cut in length, not in each channel.
     """
 
     def __init__(self, band: Band, *, turns: bool = False) -> None:

@@ -29,6 +29,11 @@ class Kind:
         return self.name == "circular"
 
     @property
+    def turns(self) -> bool:
+        """True for channels that are parts of a complex number: what is done to them must not depend on its phase."""
+        return self.is_circular or self.is_complex
+
+    @property
     def unit(self) -> float:
         """Data units per unit of the channels: P / 2 pi for angles, whose channels are cos and sin; else 1."""
         return self.period / (2 * np.pi) if self.is_circular else 1.0

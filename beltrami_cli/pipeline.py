@@ -85,8 +85,7 @@ def _denoise_series(
         series = formats.open_series(
             job.data, spacing=_spacing_for(job.data, job.spacing), dtype=job.settings.precision, plane=_is_plane(job)
         )
-    first = Volume(series.frame(0), series.grid)
-    like = replace(series, grid=first.grid) if psi is None else replace(series, grid=psi.grid)
+    like = series if psi is None else replace(series, grid=psi.grid)
     solver = _solver(job, psi, like.grid, phases, warnings)
 
     def frame(t: int) -> np.ndarray:
@@ -148,7 +147,7 @@ def mesh_of(
     require_same_grid(psi.grid, f"LEVELSET {levelset}", volume.grid, f"DATA {data}", remedy=REMEDY)
     kind = kind_of("circular" if period else "vector", volume.data, period)[0]
     own = own_samples(band, kind.to_channels(band.gather(plane.forth(volume.data))))
-    mesh, values = surface_mesh(band, own, turns=kind.is_circular)
+    mesh, values = surface_mesh(band, own, turns=kind.turns)
     assert values is not None
     if not np.isfinite(values).any():
         raise DataError(f"DATA {data} has no value on the surface: found only NaN there; drop it for a bare mesh")

@@ -137,13 +137,14 @@ class Solver:
             own = own_samples(self.band, channels, every=self.settings.extension == "none")
             trust = np.where(np.isnan(own[0]), 0, self.trust).astype(own.dtype)
             own[:, trust == 0] = np.nan
-            course = replace(self.course, kind=kind)
-            start = course.start(own, trust)
+            if kind != self.course.kind:  # else its re-extension is already prepared
+                self.course = replace(self.course, kind=kind)
+            start = self.course.start(own, trust)
         missing = np.isnan(start.values[0, self.band.primary]).mean()
         if missing > LONE_SHARE:
             share = f"{100 * missing:.1f} %"
             warnings.add(f"{share} of the band lies on parts of the surface without any data: left missing")
-        return Sample(course, own, trust, start)
+        return Sample(self.course, own, trust, start)
 
     def _plan(self, sample: Sample) -> Plan:
         """Which flow, and its schedule, by the settings and, where they say so, by the data."""
@@ -151,36 +152,33 @@ class Solver:
         slope = typical_slope(self.band, start.values, start.known) * course.kind.unit
         noise = noise_sd(self.band, sample.own, course.kind)
         flow = Flow("beltrami" if settings.flow == "auto" else settings.flow, settings.phi_name, settings.scheme)
-        fixed = self._fixed_beta(slope)
-        steps, ends_by, choice = self.iterations, self.ends_by, None
-        if isinstance(fixed, np.ndarray):  # a schedule
-            return Plan(flow, Schedule(fixed, course.dt, ends_by), slope, noise, None)
-        if not slope and settings.stop is not None:  # constant data: nothing to choose, and nothing to flow
-            steps = 0
-        elif slope and self._chooses(fixed, sample):
+        if len(settings.beta.values) > 1:
+            schedule = Schedule(settings.beta.over(self.iterations), course.dt, self.ends_by)
+            return Plan(flow, schedule, slope, noise, None)
+        fixed, steps, choice = self._fixed_beta(slope), self.iterations, None
+        beta = fixed if fixed is not None else 1 / slope if slope else 0.0
+        if not slope:  # constant data: nothing to choose, and nothing to flow
+            steps = 0 if settings.stop is not None else steps
+        elif self._chooses(fixed, sample):
             with self.phases("choose"):
                 choice = choose(
                     course, sample.own, sample.trust, self._families(fixed, slope), slope, steps, settings.seed,
                     stop=settings.stop == "auto",
                 )  # fmt: skip
-            flow, fixed, steps = choice.flow, choice.beta, choice.iterations
+            flow, beta, steps = choice.flow, choice.beta, choice.iterations
             self._doubt(choice, sample)
-        elif fixed is None:
-            fixed = 1 / slope if slope else 0.0
         if settings.stop == "decorrelation" and steps:
             with self.phases("choose"):
-                steps = decorrelated(course, start, flow, fixed, steps)
-        return Plan(flow, Schedule(np.full(steps, fixed), course.dt, ends_by), slope, noise, choice)
+                steps = decorrelated(course, start, flow, beta, steps)
+        return Plan(flow, Schedule(np.full(steps, beta), course.dt, self.ends_by), slope, noise, choice)
 
-    def _fixed_beta(self, slope: float) -> np.ndarray | float | None:
-        """beta in mm per data unit, one per iteration where it is a schedule; None where it is to be chosen."""
+    def _fixed_beta(self, slope: float) -> float | None:
+        """beta in mm per data unit where it is given, None where it is to be chosen."""
         settings = self.settings
         if settings.flow == "l2":
             return 0.0
         if settings.flow in ("l1", "tv"):
             return self._beta_of_eps(slope)
-        if len(settings.beta.values) > 1:
-            return settings.beta.over(self.iterations)
         return None if settings.beta.is_auto else settings.beta.values[0]
 
     def _beta_of_eps(self, slope: float) -> float:
@@ -254,7 +252,7 @@ class Solver:
         with self.phases("mesh"):
             mesh = None
             if not settings.flat:
-                mesh, at_vertices = surface_mesh(band, values, turns=course.kind.is_circular)
+                mesh, at_vertices = surface_mesh(band, values, turns=course.kind.turns)
                 assert at_vertices is not None
                 mesh = replace(mesh, values=course.kind.at_vertices(at_vertices))
         out = self._volume(course.kind.to_values(values), data)
@@ -366,12 +364,14 @@ def _within_range(values: np.ndarray, start: Extended, kind: Kind) -> tuple[np.n
     """Values (K, E), NaN where missing, kept within each channel's range in the data, and by how much they had left it.
 
     No flow leaves the range; differences do, a little, beside the band's ragged rim. Raises NumericsError where it was
-    more than the range's own width: no error of differences, but a runaway. Angles have no range to leave.
+    more than the range's own width: no error of differences, but a runaway. Complex numbers keep to the largest length.
     """
-    if kind.is_circular:
-        if np.nanmax(np.abs(values)) > 2:  # cos and sin; a mean of them is no longer than 1
-            raise NumericsError("the flow of the angle ran away; try a smaller --dt or --scheme symmetric")
-        return values, 0.0
+    if kind.turns:
+        size, largest = np.hypot(*values), float(np.hypot(*start.values[:, start.known]).max())
+        excess = max(float(np.nanmax(size)) - largest, 0.0)
+        if not excess <= largest:
+            raise NumericsError("the flow ran away from the data's range; try a smaller --dt or --scheme symmetric")
+        return values * np.minimum(1, largest / np.maximum(size, 1e-30)), 0.0 if kind.is_circular else excess
     most = 0.0
     for channel, first in zip(values, start.values[:, start.known].astype(float), strict=True):
         low, high = first.min(), first.max()

@@ -15,7 +15,7 @@ import numpy as np
 
 from beltrami_cli.band import Band
 from beltrami_cli.course import Course
-from beltrami_cli.errors import DataError
+from beltrami_cli.errors import DataError, NumericsError
 from beltrami_cli.evolve import Schedule, Stop
 from beltrami_cli.extension import Extended
 from beltrami_cli.flows import Flow
@@ -144,7 +144,10 @@ def choose(
     def curve(flow: Flow, beta: float) -> Curve:
         rival = min(curves, key=lambda c: c.error, default=None)
         watch = _Watch(course.kind, held, truth, weight, rival, to_end=not stop)
-        course.run(start, flow, Schedule(np.full(iterations, beta), course.dt), stop=watch)
+        try:
+            course.run(start, flow, Schedule(np.full(iterations, beta), course.dt), stop=watch)
+        except NumericsError:  # channels so steep for this beta that a step would take minutes
+            watch.errors[watch.least :] = [np.inf]
         curves.append(Curve(flow, beta, np.array(watch.errors), watch.least, watch.gain))
         return curves[-1]
 

@@ -584,3 +584,8 @@ def test_flat_config(folder):
 )
 def test_what_an_override_displaces_goes_with_it(base, over, expected):
     assert overlaid(base, over) == expected
+
+
+def test_discrepancy_cannot_choose_the_flow():
+    with pytest.raises(RefusedError, match="cannot tell which flow is best"):
+        Settings(flow="auto", stop="discrepancy")
