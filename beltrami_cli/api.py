@@ -13,8 +13,9 @@ from beltrami_cli.config import Settings, parse_spacing
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.grid import Grid
+from beltrami_cli.inputs import Warnings
 from beltrami_cli.progress import Phases
-from beltrami_cli.solver import Result, Solver, Warnings
+from beltrami_cli.solver import Result, Solver
 
 
 def denoise(

@@ -10,9 +10,9 @@ from beltrami_cli import formats
 from beltrami_cli.config import Settings
 from beltrami_cli.errors import BeltramiError, RefusedError
 from beltrami_cli.grid import Volume, require_same_grid
+from beltrami_cli.inputs import PlaneLast, Warnings, band_of, require_usable
 from beltrami_cli.levelset import crossing_box, two_values
 from beltrami_cli.metrics import Difference, difference
-from beltrami_cli.solver import PlaneLast, Warnings, band_of, require_usable
 
 REMEDY = "bring them onto one grid first, for example with denoise --resample"
 

@@ -18,12 +18,13 @@ from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import own_samples
 from beltrami_cli.grid import Grid, Volume, require_same_grid
+from beltrami_cli.inputs import PlaneLast, Warnings, band_of, require_usable, time_step, without
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import sidecar
 from beltrami_cli.resample import resample
 from beltrami_cli.sampling import surface_mesh
-from beltrami_cli.solver import PlaneLast, Result, Solver, Warnings, band_of, require_usable, time_step, without
+from beltrami_cli.solver import Result, Solver
 from beltrami_cli.surface import Mesh
 
 REMEDY = "--resample brings it onto the level set's grid"

@@ -16,27 +16,12 @@ import numpy as np
 from beltrami_cli import __version__
 from beltrami_cli.band import Band
 from beltrami_cli.config import Job, Settings
-from beltrami_cli.evolve import Evolution, Schedule
+from beltrami_cli.evolve import Evolution
 from beltrami_cli.extension import Extended
-from beltrami_cli.flows import Flow
 from beltrami_cli.grid import Grid
 from beltrami_cli.kinds import Kind
+from beltrami_cli.planning import Plan
 from beltrami_cli.tuning import Choice, near_surface
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What is to run: chosen once, for all frames of a series alike.
-
-    slope: typical slope of the data; noise: (K,) standard deviations or (1,), data units; choice: None where beta and
-    duration were given.
-    """
-
-    flow: Flow
-    schedule: Schedule
-    slope: float
-    noise: np.ndarray
-    choice: Choice | None
 
 
 @dataclass(frozen=True, eq=False)
