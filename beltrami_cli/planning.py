@@ -48,7 +48,10 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Planner:
-    """Plans by the settings and the data. iterations: how many, or the most that a stopping rule may take; ends_by: what ends the run."""
+    """Plans by the settings and the data.
+
+    iterations: how many, or the most that a stopping rule may take; ends_by: what ends the run.
+    """
 
     settings: Settings
     iterations: int

@@ -83,7 +83,7 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
             "meaning": "input minus output at valid voxels within half a voxel of the surface",
         },
         "ClippedExcess": ran.excess,
-        "Choice": None if plan.choice is None else _chosen(plan.choice, ran.kind),
+        "Choice": None if plan.choice is None else _chosen(plan.choice),
         "PerIteration": {
             "beta": beta.tolist(),
             "dt": [schedule.dt] * len(beta),
@@ -113,7 +113,7 @@ def _used(settings: Settings, band: Band, plan: Plan, evolution: Evolution, kind
     }
 
 
-def _chosen(choice: Choice, kind: Kind) -> dict[str, Any]:
+def _chosen(choice: Choice) -> dict[str, Any]:
     return {
         "flow": choice.flow.name,
         "phi": choice.flow.phi if choice.flow.name == "phi" else None,
@@ -122,7 +122,7 @@ def _chosen(choice: Choice, kind: Kind) -> dict[str, Any]:
         "held_out_voxels": choice.held_out,
         "gain_standard_errors": choice.gain,
         "meaning": "error: root mean square at the held-out voxels, data units; each row at its best iteration",
-        "table": choice.table(kind),
+        "table": choice.table(),
     }
 
 

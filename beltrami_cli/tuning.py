@@ -73,16 +73,19 @@ class Choice:
     def is_clear(self) -> bool:
         return self.gain >= CLEAR
 
-    def table(self, kind: Kind) -> list[dict[str, float | int | str | None]]:
-        """Each run's flow, beta (mm per data unit), best iteration and root mean square error there (data units)."""
+    def table(self) -> list[dict[str, float | int | str | None]]:
+        """Each run's flow, beta (mm per data unit), best iteration and root mean square error there (data units).
+
+        An error of None is that of a run that could not be made.
+        """
         return [
             {
                 "flow": c.flow.name,
                 "phi": c.flow.phi if c.flow.name == "phi" else None,
                 "beta": c.beta if c.flow.has_beta else None,
                 "iterations": c.iterations,
-                "error": float(np.sqrt(c.error)),
-                "error_at_start": float(np.sqrt(c.errors[0])),
+                "error": float(np.sqrt(c.error)) if np.isfinite(c.error) else None,
+                "error_at_start": float(np.sqrt(c.errors[0])) if np.isfinite(c.error) else None,
                 "iterations_tried": len(c.errors) - 1,
             }
             for c in self.curves
@@ -132,7 +135,7 @@ def choose(
 
     own: (K, E) samples of weights trust (E,). slope: typical slope of the data (data units per mm), where the search
     over beta starts. Without `stop`, runs are compared at their last iteration.
-    Raises DataError where too few voxels hold data.
+    Raises DataError where too few voxels hold data, NumericsError where no run stays within the finite numbers.
     """
     held = hold_out(course.band, trust, seed)
     rest, left = own.copy(), trust.copy()
@@ -146,18 +149,22 @@ def choose(
         watch = _Watch(course.kind, held, truth, weight, rival, to_end=not stop)
         try:
             course.run(start, flow, Schedule(np.full(iterations, beta), course.dt), stop=watch)
-        except NumericsError:  # channels so steep for this beta that a step would take minutes
-            watch.errors[watch.least :] = [np.inf]
+        except NumericsError as error:  # channels so steep for this beta that a step would take minutes
+            failures.append(error)
+            watch.errors, watch.least = [np.inf], 0
         curves.append(Curve(flow, beta, np.array(watch.errors), watch.least, watch.gain))
         return curves[-1]
 
     curves: list[Curve] = []
+    failures: list[NumericsError] = []
     for family in families:
         if family.beta is not None:
             curve(family.flow, family.beta)
         else:
             search(lambda x, flow=family.flow: curve(flow, 2.0**x / slope).error)  # type: ignore[misc]
     best = min(curves, key=lambda c: c.error)
+    if best.error == np.inf:
+        raise failures[0]
     return Choice(
         best.flow, best.beta, best.iterations, best.gain,
         stop and best.iterations == iterations, len(held), tuple(curves),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numba
 import numpy as np
 import pytest
 from command import ball, done, load, nifti, noisy, npy, record
@@ -137,6 +138,52 @@ def test_masked_values_are_missing():
     masked = np.ma.masked_array(np.where(hidden, 1e6, values), hidden)
     expected = denoise(ball(), np.where(hidden, np.nan, values))
     assert np.array_equal(denoise(ball(), masked).data, expected.data, equal_nan=True)
+
+
+@pytest.mark.parametrize("options", [{}, {"independent": True}])
+@pytest.mark.parametrize("levelset", [ball((40, 40), 12.0), ball(), None], ids=["plane", "volume", "flat"])
+def test_shapes_of_channels(levelset, options):
+    shape = (40, 40) if levelset is None else levelset.shape
+    data = np.stack([noisy(shape), noisy(shape, seed=1), noisy(shape, seed=2)], -1)
+    result = denoise(levelset, data, kind="vector", flat=levelset is None, beta=0.1, **options)
+    assert result.data.shape == data.shape and result.filled.shape == shape
+    if levelset is not None:
+        assert result.mesh is not None and result.mesh.values is not None
+        assert result.mesh.values.shape == (len(result.mesh.vertices_ras_mm), 3)
+    json.dumps(result.record, allow_nan=False)
+
+
+@pytest.mark.parametrize("shape, radius", [((16, 16, 16), 5.0), ((40, 40), 12.0)])
+def test_weights_and_masks_of_any_layout(shape, radius):
+    psi, data, weights = ball(shape, radius), noisy(shape), np.abs(noisy(shape, 0, 1, seed=1))
+    mask = noisy(shape, seed=2) > 40
+    expected = denoise(psi, data, weights=weights, mask=mask, beta=0.1)
+    assert expected.filled.shape == shape
+    hidden = np.ma.masked_array(np.where(mask, weights, 99), ~mask)
+    for options in (
+        {"weights": weights.tolist(), "mask": mask.astype(np.uint8)},
+        {"weights": np.asfortranarray(weights, np.float64), "mask": np.where(mask, 7.0, np.nan)},
+        {"weights": np.where(mask, weights, np.nan)},
+        {"weights": hidden},
+    ):
+        assert np.array_equal(denoise(psi, data, beta=0.1, **options).data, expected.data, equal_nan=True)
+
+
+def test_weights_are_not_touched():
+    weights, mask = np.abs(noisy()), noisy() > 40
+    weights[3] = -1e-5
+    copies = weights.copy(), mask.copy()
+    weights.flags.writeable = mask.flags.writeable = False
+    denoise(ball(), noisy(), weights=weights, mask=mask, beta=0.1)
+    assert np.array_equal(weights, copies[0]) and np.array_equal(mask, copies[1])
+
+
+def test_threads_stay_the_callers_own():
+    before = numba.get_num_threads()
+    denoise(ball(), noisy(), threads=1, beta=0.1)
+    with pytest.raises(DataError):
+        denoise(ball(), noisy(), threads=1, mask=np.zeros(ball().shape))
+    assert numba.get_num_threads() == before
 
 
 def test_package_names():

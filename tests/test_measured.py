@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -9,7 +10,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 
-from beltrami_cli import Result, denoise
+from beltrami_cli import denoise
 from beltrami_cli.formats import read_volume
 from beltrami_cli.surface import Mesh
 
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 WORKBENCH_PATCH = 19.8  # dB, the best of its geodesic Gaussians over a sweep of widths
-ANGLES = {"circular": {"kind": "circular", "period": 360}, "scalar": {}}
+DEGREES = {"kind": "circular", "period": 360}
 
 
 @pytest.fixture
@@ -28,9 +29,14 @@ def cases(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return cortex_cases
 
 
+@cache
+def angle_cases(cases: ModuleType) -> dict:
+    return {case.name: case for case in cases.angle_cases()}
+
+
 def score(case) -> float:
     psi = read_volume(case.levelset)
-    options = ANGLES[case.kind.name]
+    options = DEGREES if case.kind.is_circular else {}
     result = denoise(psi.data, case.volume.data, affine=psi.grid.affine, depth=(-2, 2), stop="auto", **options)
     assert result.warnings == () and result.mesh is not None
     return case.score(case.at_own_vertices(result.mesh.vertices_ras_mm, result.mesh.cells, result.mesh.values))
@@ -40,8 +46,7 @@ def score(case) -> float:
     "name, degrees", [("angle-0.3", 3.5), ("angle-0.6", 5.6), ("angle-1.0", 7.2), ("angle-1.0-holes", 7.2)]
 )
 def test_angles_of_known_truth(cases, name, degrees):
-    (case,) = (case for case in cases.angle_cases() if case.name == name)
-    assert score(case) <= degrees
+    assert score(angle_cases(cases)[name]) <= degrees
 
 
 def test_patch_with_a_sharp_border(cases):
@@ -63,8 +68,7 @@ def at_vertices(cases: ModuleType, mesh: Mesh, vertices: np.ndarray) -> np.ndarr
 def test_measured_angles_move_toward_the_mean_of_20_people(cases, shared_data, person, fall):
     folder = shared_data / "retino_hcp7t_measured"
     psi, angle, r2 = (read_volume(folder / f"{name}.nii.gz") for name in ("psi", f"{person}_angle", f"{person}_r2"))
-    options = ANGLES["circular"]
-    result = denoise(psi.data, angle.data, weights=r2.data, affine=psi.grid.affine, **options)
+    result = denoise(psi.data, angle.data, weights=r2.data, affine=psi.grid.affine, **DEGREES)
     vertices, _ = cases.read_surface(folder / "lh.crop.surf.gii")
     maps = {m.meta["Name"]: m.data for m in nib.load(folder / "lh.crop.func.gii").darrays}
     before, after = maps[f"{person}_angle"], at_vertices(cases, result.mesh, vertices)
@@ -76,16 +80,12 @@ def test_measured_angles_move_toward_the_mean_of_20_people(cases, shared_data, p
     assert areas.sum() > 1000 and distances[1] < distances[0] - fall, distances
 
 
-def layered(shared_data: Path, **options) -> tuple[Result, np.ndarray]:
+@pytest.mark.parametrize("options", [{}, {"depth": (-1, 1), "stop": "auto"}])
+def test_bold_and_vaso_as_coupled_channels(shared_data, options):
     folder = shared_data / "laynii_lo"
     psi, *maps = (read_volume(folder / f"{n}.nii.gz") for n in ("derived_psi_midlayer", "lo_BOLD_act", "lo_VASO_act"))
     data = np.stack([volume.data for volume in maps], -1)
-    return denoise(psi.data, data, affine=psi.grid.affine, kind="vector", **options), data
-
-
-@pytest.mark.parametrize("options", [{}, {"depth": (-1, 1), "stop": "auto"}])
-def test_bold_and_vaso_as_coupled_channels(shared_data, options):
-    result, data = layered(shared_data, **options)
+    result = denoise(psi.data, data, affine=psi.grid.affine, kind="vector", **options)
     seen = np.isfinite(result.data)
     assert np.array_equal(seen[..., 0], seen[..., 1]) and seen[..., 0].sum() > 1000
     assert np.isfinite(result.mesh.values).all() and result.mesh.values.shape[1] == 2

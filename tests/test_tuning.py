@@ -201,6 +201,36 @@ def test_beats_the_best_l2_and_tv_beside_edges(case):
     assert found > oracle.best(Flow("tv"), np.array([10.0, 30.0]) / oracle.slope) + 0.3
 
 
+@pytest.mark.parametrize("kind", ["circular", "vector", "weighted"])
+def test_values_of_every_kind_are_judged_alike(kind):
+    made, random = torus(32, map="mixed", noise=0.0), np.random.default_rng(0)
+    clean, options = made.clean, {}
+    noise = 25 * random.standard_normal((*clean.shape, 2))
+    if kind == "vector":
+        clean, options = np.stack([clean, 200 - 0.5 * clean], -1), {"kind": "vector"}
+    else:
+        noise = noise[..., 0]
+    if kind == "circular":
+        options = {"kind": "circular", "period": 360.0}
+    if kind == "weighted":
+        poor = random.random(clean.shape) < 0.3
+        noise[poor] *= 4
+        options = {"weights": np.where(poor, 1 / 16, 1)}
+
+    def error(result: Result) -> float:
+        off = (result.data - clean)[np.abs(made.levelset) < 0.5]
+        return float(np.sqrt(np.mean(((off + 180) % 360 - 180) ** 2)))
+
+    result = denoise(made.levelset, clean + noise, stop="auto", **options)
+    assert "correlated" not in " ".join(result.warnings)
+    best = min(
+        error(denoise(made.levelset, clean + noise, beta=beta, iterations=count, **options))
+        for beta in (0.02, 0.05, 0.1)
+        for count in (5, 10, 20)
+    )
+    assert error(result) < 1.06 * best  # half a decibel
+
+
 def test_every_flow_competes():
     record = automatic("pieces", 40.0, "auto").record
     choice = record["Choice"]

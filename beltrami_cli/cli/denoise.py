@@ -253,6 +253,7 @@ def _tell_details(record: dict[str, Any]) -> None:
             f"typical slope of the data {record['TypicalSlope']:.5g} per mm",
         )
     for row in (record.get("Choice") or {}).get("table") or ():
-        note(False, f"held out: {_combination(row)}: error {row['error']:.5g}")
+        error = "did not run" if row["error"] is None else f"error {row['error']:.5g}"
+        note(False, f"held out: {_combination(row)}: {error}")
     phases = ", ".join(f"{name} {seconds:.2f}" for name, seconds in record["Seconds"].items())
     note(False, f"seconds: {phases}; peak memory {record['PeakMemoryMiB']} MiB")
