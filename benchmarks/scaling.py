@@ -19,11 +19,11 @@ def main() -> None:
         "as it is": (psi, data),
         "padded": (np.pad(psi, around, constant_values=psi.max()), np.pad(data, around, constant_values=np.nan)),
     }
-    run_command(psi, data, "--iterations", "1")  # compiles, if this is the first run ever
+    run_command(psi, data, "--beta", "0.05", "--iterations", "1")  # compiles, if this is the first run ever
     records: dict[str, list] = {name: [] for name in volumes}
     for _ in range(REPEATS):
         for name, pair in volumes.items():
-            records[name].append(run_command(*pair, "--iterations", "20")[1])
+            records[name].append(run_command(*pair, "--beta", "0.05", "--iterations", "20")[1])
 
     phases = list(records["padded"][0]["Seconds"])
     print(f"{'seconds':10}" + "".join(f"{phase:>9}" for phase in phases) + f"{'MiB':>9}{'entries':>10}{'voxels':>12}")

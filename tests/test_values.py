@@ -128,16 +128,31 @@ def test_one_channel_is_a_scalar(options):
     assert same(np.squeeze(vector.mesh.values), scalar.mesh.values)
 
 
+COMPLEX = ((WAVE + NOISE) + 1j * (WAVE[::-1] - NOISE[::-1])).astype(np.complex64)
+
+
 @pytest.mark.parametrize("options", [*OPTIONS, {"flow": "l2"}], ids=str)
 def test_complex_data_are_two_channels(options):
-    data = with_hole((WAVE + NOISE) + 1j * (WAVE[::-1] - NOISE[::-1])).astype(np.complex64)
-    one, two = (denoise(PSI, d, kind="vector", **options) for d in (data, np.stack([data.real, data.imag], -1)))
+    """But for overshoot, which is cut in length where the data are complex, and in each channel where they are not."""
+    pair = np.stack([COMPLEX.real, COMPLEX.imag], -1)
+    one, two = (denoise(PSI, d, kind="vector", extend_every=0, **options) for d in (COMPLEX, pair))
     assert one.data.shape == SHAPE and one.data.dtype == np.complex64
     seen = ~np.isnan(one.data)
     assert np.array_equal(seen, ~np.isnan(two.data).any(-1)) and seen[NEAR].all()
-    assert same(one.data[seen].real, two.data[seen, 0]) and same(one.data[seen].imag, two.data[seen, 1])
-    assert same(one.mesh.values, two.mesh.values) and one.mesh.values.shape[1] == 2
+    off = np.abs(one.data[seen] - (two.data[seen, 0] + 1j * two.data[seen, 1]))
+    assert (off == 0).mean() > 0.99 and off.max() < 1
+    assert one.mesh.values.shape[1] == 2 and np.abs(one.mesh.values - two.mesh.values).max() < 1
     assert one.record["Values"]["channels"] == two.record["Values"]["channels"] == 2
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_phase_of_complex_data_turns_with_the_result(options):
+    turn = np.exp(1j * np.radians(123.4))
+    first, other = (
+        denoise(PSI, with_hole(COMPLEX).astype(np.complex128) * by, kind="vector", precision="float64", **options)
+        for by in (1, turn)
+    )
+    assert np.nanmax(np.abs(other.data - first.data * turn)) < 1e-6 * np.nanmax(np.abs(first.data))
 
 
 def test_frames_apart_are_scalar_runs():

@@ -3,8 +3,9 @@
 Arrays run over the band's E entries: u (K, E), normal (3, E), forward and backward (3, E) neighbour entries, a missing
 link pointing to the entry itself. A scheme writes the fluxes c v per mm through each entry's forward faces, (K, 3, E),
 and `diverge` makes the step of them. Loops are cut where a gather or a choice of law would keep one from vectorising,
-and run block by block, so that what one loop leaves the next finds in the cache. Indices are unsigned, for numba tests
-every signed one for being negative.
+and run block by block, so that what one loop leaves the next finds in the cache. Channels are taken out of (K, E)
+arrays before a parallel loop begins, for only of what enters it whole is it known to overlap with nothing. Indices are
+unsigned, for numba tests every signed one for being negative.
 """
 
 import numba as nb
@@ -66,14 +67,14 @@ def symmetric(u, normal, forward, backward, spacing, law, beta, flux, work, c):
     f0, f1, f2 = forward[0], forward[1], forward[2]
     r0, r1, r2 = backward[0], backward[1], backward[2]
     form = flux[0, 0]  # free until the fluxes are known
-    for block in nb.prange(blocks):
-        low, high = np.uint64(block * BLOCK), np.uint64(min(entries, (block + 1) * BLOCK))
-        for m in range(low, high):
-            c[m] = zero
-            form[m] = zero
-        for k in range(channels):
-            v = u[k]
-            q0, q1, q2 = work[k, 0], work[k, 1], work[k, 2]
+    for k in range(channels):
+        v, q0, q1, q2 = u[k], work[k, 0], work[k, 1], work[k, 2]
+        for block in nb.prange(blocks):
+            low, high = np.uint64(block * BLOCK), np.uint64(min(entries, (block + 1) * BLOCK))
+            if k == 0:
+                for m in range(low, high):
+                    c[m] = zero
+                    form[m] = zero
             for m in range(low, high):
                 x0, x1, x2 = (v[f0[m]] - v[m]) * i0, (v[f1[m]] - v[m]) * i1, (v[f2[m]] - v[m]) * i2
                 y0, y1, y2 = (v[m] - v[r0[m]]) * i0, (v[m] - v[r1[m]]) * i1, (v[m] - v[r2[m]]) * i2
@@ -86,27 +87,20 @@ def symmetric(u, normal, forward, backward, spacing, law, beta, flux, work, c):
                 q0[m], q1[m], q2[m] = half * k0 * i0, half * k1 * i1, half * k2 * i2
                 square = half * (e0 * (x0 * x0 + y0 * y0) + e1 * (x1 * x1 + y1 * y1) + e2 * (x2 * x2 + y2 * y2))
                 form[m] += square + k0 * g0 + k1 * g1 + k2 * g2
-        energies[block] = diffuse(law, u.dtype.type(beta) ** 2, c, form, low, high)
-        for k in range(channels):
-            q0, q1, q2 = work[k, 0], work[k, 1], work[k, 2]
-            for m in range(low, high):
-                q0[m] *= c[m]
-                q1[m] *= c[m]
-                q2[m] *= c[m]
-    for block in nb.prange(blocks):
-        low, high = np.uint64(block * BLOCK), np.uint64(min(entries, (block + 1) * BLOCK))
-        for k in range(channels):
-            v = u[k]
-            q0, q1, q2 = work[k, 0], work[k, 1], work[k, 2]
-            w0, w1, w2 = flux[k, 0], flux[k, 1], flux[k, 2]
-            for m in range(low, high):
+            if k == channels - 1:
+                energies[block] = diffuse(law, u.dtype.type(beta) ** 2, c, form, low, high)
+    for k in range(channels):
+        v, q0, q1, q2 = u[k], work[k, 0], work[k, 1], work[k, 2]
+        w0, w1, w2 = flux[k, 0], flux[k, 1], flux[k, 2]
+        for block in nb.prange(blocks):
+            for m in range(np.uint64(block * BLOCK), np.uint64(min(entries, (block + 1) * BLOCK))):
                 a, b, d = f0[m], f1[m], f2[m]
                 p0 = c[m] * (one - n0[m] * n0[m]) + c[a] * (one - n0[a] * n0[a])
                 p1 = c[m] * (one - n1[m] * n1[m]) + c[b] * (one - n1[b] * n1[b])
                 p2 = c[m] * (one - n2[m] * n2[m]) + c[d] * (one - n2[d] * n2[d])
-                w0[m] = h0 * p0 * (v[a] - v[m]) + q0[m] + q0[a] if a != m else zero
-                w1[m] = h1 * p1 * (v[b] - v[m]) + q1[m] + q1[b] if b != m else zero
-                w2[m] = h2 * p2 * (v[d] - v[m]) + q2[m] + q2[d] if d != m else zero
+                w0[m] = h0 * p0 * (v[a] - v[m]) + c[m] * q0[m] + c[a] * q0[a] if a != m else zero
+                w1[m] = h1 * p1 * (v[b] - v[m]) + c[m] * q1[m] + c[b] * q1[b] if b != m else zero
+                w2[m] = h2 * p2 * (v[d] - v[m]) + c[m] * q2[m] + c[d] * q2[d] if d != m else zero
     return 0.5 * total(energies)
 
 
@@ -124,27 +118,29 @@ def paper(u, normal, forward, backward, spacing, law, beta, flux, work, c):
     n0, n1, n2 = normal[0], normal[1], normal[2]
     f0, f1, f2 = forward[0], forward[1], forward[2]
     form = work[0, 0]
-    for block in nb.prange(blocks):
-        low, high = np.uint64(block * BLOCK), np.uint64(min(entries, (block + 1) * BLOCK))
-        for m in range(low, high):
-            c[m] = zero
-        for k in range(channels):
-            v = u[k]
-            w0, w1, w2 = flux[k, 0], flux[k, 1], flux[k, 2]
+    for k in range(channels):
+        v, w0, w1, w2 = u[k], flux[k, 0], flux[k, 1], flux[k, 2]
+        for block in nb.prange(blocks):
+            low, high = np.uint64(block * BLOCK), np.uint64(min(entries, (block + 1) * BLOCK))
+            if k == 0:
+                for m in range(low, high):
+                    form[m] = zero
             for m in range(low, high):
                 g0, g1, g2 = (v[f0[m]] - v[m]) * i0, (v[f1[m]] - v[m]) * i1, (v[f2[m]] - v[m]) * i2
                 s = n0[m] * g0 + n1[m] * g1 + n2[m] * g2
                 v0, v1, v2 = g0 - s * n0[m], g1 - s * n1[m], g2 - s * n2[m]
-                c[m] += v0 * v0 + v1 * v1 + v2 * v2
+                form[m] += v0 * v0 + v1 * v1 + v2 * v2
                 w0[m] = v0 * i0 if f0[m] != m else zero
                 w1[m] = v1 * i1 if f1[m] != m else zero
                 w2[m] = v2 * i2 if f2[m] != m else zero
-        for m in range(low, high):
-            form[m] = c[m]
-        energies[block] = diffuse(law, u.dtype.type(beta) ** 2, c, form, low, high)
-        for k in range(channels):
-            w0, w1, w2 = flux[k, 0], flux[k, 1], flux[k, 2]
-            for m in range(low, high):
+            if k == channels - 1:
+                for m in range(low, high):
+                    c[m] = form[m]
+                energies[block] = diffuse(law, u.dtype.type(beta) ** 2, c, form, low, high)
+    for k in range(channels):
+        w0, w1, w2 = flux[k, 0], flux[k, 1], flux[k, 2]
+        for block in nb.prange(blocks):
+            for m in range(np.uint64(block * BLOCK), np.uint64(min(entries, (block + 1) * BLOCK))):
                 w0[m] *= c[m]
                 w1[m] *= c[m]
                 w2[m] *= c[m]
@@ -162,11 +158,10 @@ def diverge(u, flux, backward, a, outer, dt, out):
     changes = np.zeros(blocks)
     one, zero, step = u.dtype.type(1), u.dtype.type(0), u.dtype.type(dt)
     r0, r1, r2 = backward[0], backward[1], backward[2]
-    for block in nb.prange(blocks):
-        change = zero
-        for k in range(channels):
-            v, o = u[k], out[k]
-            w0, w1, w2 = flux[k, 0], flux[k, 1], flux[k, 2]
+    for k in range(channels):
+        v, o, w0, w1, w2 = u[k], out[k], flux[k, 0], flux[k, 1], flux[k, 2]
+        for block in nb.prange(blocks):
+            change = zero
             for m in range(np.uint64(block * BLOCK), np.uint64(min(entries, (block + 1) * BLOCK))):
                 s = w0[m] + w1[m] + w2[m]
                 s -= w0[r0[m]] if r0[m] != m else zero
@@ -175,5 +170,5 @@ def diverge(u, flux, backward, a, outer, dt, out):
                 s *= step * (a[m] if outer else one)
                 o[m] = v[m] + s
                 change += s * s
-        changes[block] = change
+            changes[block] += change
     return total(changes)
