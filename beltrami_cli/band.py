@@ -67,7 +67,7 @@ class Band:
         box = np.ascontiguousarray(volume[self.box])
         return box.reshape(-1, *box.shape[3:])[self.voxel]
 
-    def scatter(self, values: np.ndarray, outside: np.ndarray | float) -> np.ndarray:
+    def scatter(self, values: np.ndarray, outside: np.ndarray | complex) -> np.ndarray:
         """A volume (nx, ny, nz, ...): primary entries' values (E, ...) in the band, `outside` elsewhere."""
         out = np.empty(self.grid.shape + values.shape[1:], values.dtype)
         out[...] = outside

@@ -14,7 +14,7 @@ from beltrami_cli.flows import Flow, typical_slope
 from beltrami_cli.inputs import Warnings
 from beltrami_cli.noise import looks_correlated, noise_sd
 from beltrami_cli.progress import Phases
-from beltrami_cli.tuning import LEAST_VOXELS, Choice, Family, can_hold_out, choose, decorrelated
+from beltrami_cli.tuning import LEAST_HELD, Choice, Family, can_hold_out, choose, decorrelated
 
 # eps of the flows l1 and tv as a share of the data's typical slope: so small that nearly every slope counts as an edge.
 EPS_SHARE = 0.1
@@ -82,7 +82,7 @@ class Planner:
             self._doubt(choice, sample)
         if settings.stop == "decorrelation" and steps:
             with self.phases("choose"):
-                steps = decorrelated(course, start, flow, beta, steps)
+                steps = decorrelated(course, sample.own, sample.trust, start, flow, beta, steps)
         return Plan(flow, Schedule(np.full(steps, beta), course.dt, self.ends_by), slope, noise, choice)
 
     def _fixed_beta(self, slope: float) -> float | None:
@@ -108,8 +108,8 @@ class Planner:
         if self.settings.flow == "auto":
             return True
         why = None
-        if len(can_hold_out(sample.course.band, sample.trust)) < LEAST_VOXELS:
-            why = f"there are fewer than {LEAST_VOXELS} valid voxels beside the surface, too few to hold some out"
+        if can_hold_out(sample.course.band, sample.trust)[1] < LEAST_HELD:
+            why = "there are too few valid voxels beside the surface to hold some out"
         elif looks_correlated(sample.course.band, sample.own, sample.course.kind):
             why = f"{CORRELATED}, so that held-out ones would be predicted from their own copies"
         if why:

@@ -93,31 +93,40 @@ class Solver:
         record: dict[str, Any],
         observer: Observer | None = None,
     ) -> Iterator[Result]:
-        """Denoise `count` frames one after another, all with what is chosen on the middle one.
+        """Denoise `count` frames one after another, all with what is chosen on the middle one (that holds data).
 
         frame: its number -> data of shape grid.shape. record: is given the middle one's record, with a list over all.
         """
-        middle = count // 2
-        plan = self.planner.plan(self._sample(frame(middle), self.warnings))
+        chosen_on, sample = self._first_sample(count, frame)
+        plan = self.planner.plan(sample)
         quiet, empty, noise = Warnings(None), [], []
         for t in range(count):
             data = frame(t)
             try:
                 sample = self._sample(data, quiet)
-                result = self._run(data, sample, plan if t == middle else replace(plan, choice=None), observer)
+                result = self._run(data, sample, plan if t == chosen_on else replace(plan, choice=None), observer)
                 noise.append(result.record["Noise"]["sd"][0])
             except DataError:
                 empty.append(t)
                 noise.append(None)
                 result = self._nothing(data)
-            if t == middle:
+            if t == chosen_on:
                 record.update(result.record)
             yield result
         if empty:
             self.warnings.add(
                 f"{len(empty)} of {count} frames have no valid data on the surface: {empty[:10]}; left missing"
             )
-        record["Frames"] = {"count": count, "chosen_on": middle, "without_data": empty, "noise_sd": noise}
+        record["Frames"] = {"count": count, "chosen_on": chosen_on, "without_data": empty, "noise_sd": noise}
+
+    def _first_sample(self, count: int, frame: Callable[[int], np.ndarray]) -> tuple[int, Sample]:
+        """The frame to choose on, from the middle on the first that holds data; raises DataError where none does."""
+        for t in [*range(count // 2, count), *range(count // 2)]:
+            try:
+                return t, self._sample(frame(t), self.warnings)
+            except DataError as error:
+                reason = error
+        raise reason
 
     def _sample(self, data: np.ndarray, warnings: Warnings) -> Sample:
         """The data as channels on the band; raises DataError where none are valid."""
@@ -175,7 +184,8 @@ class Solver:
 
     def _volume(self, values: np.ndarray, data: np.ndarray) -> np.ndarray:
         """The band's values (E, ...) as a volume in the shape of the data."""
-        outside: dict[str, np.ndarray | float] = {"nan": np.nan, "zero": 0.0, "keep": self.plane.forth(data)}
+        nan = complex(np.nan, np.nan) if np.iscomplexobj(values) else np.nan
+        outside: dict[str, np.ndarray | complex] = {"nan": nan, "zero": 0.0, "keep": self.plane.forth(data)}
         return self.plane.back(self.band.scatter(values, outside[self.settings.outside]))
 
     def _nothing(self, data: np.ndarray) -> Result:

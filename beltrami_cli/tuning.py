@@ -21,13 +21,12 @@ from beltrami_cli.extension import Extended
 from beltrami_cli.flows import Flow
 from beltrami_cli.kinds import Kind
 
-# Voxels are held out 1 to 2 voxels from the surface. Nearer ones make the start values, which would miss them: where
-# one is held out the flow has a gap to fill, and longer runs win that are too long for all data.
+# Half of the valid voxels 1 to 2 voxels from the surface are held out. Nearer ones make the start values, which would
+# miss them: where one is held out the flow has a gap to fill, and longer runs win that are too long for all data. Where
+# data end near the surface, a share of the nearer ones has to do.
 SHELL = (1.0, 2.0)
-HELD_OUT = 0.3  # share of the valid voxels there: 15 % of those within 2 voxels
+SHELL_SHARE, NEAR_SHARE = 0.5, 0.15
 LEAST_HELD = 30  # voxels, below which an error says nothing
-LEAST_VOXELS = round(LEAST_HELD / HELD_OUT)
-NEAR = 1.0  # voxels from the surface within which values are looked at for their correlation
 # A curve of error over iterations has passed its least value when it has gone on for a third as long again, and 6 more:
 # longer than from one re-extension to the next.
 PATIENCE = (1.33, 6)
@@ -92,22 +91,22 @@ class Choice:
         ]
 
 
-def can_hold_out(band: Band, trust: np.ndarray) -> np.ndarray:
-    """Entries (N,) of voxels near the surface of which some can be held out; trust: (E,) weights, 0 where missing."""
+def can_hold_out(band: Band, trust: np.ndarray) -> tuple[np.ndarray, int]:
+    """Entries (N,) of voxels near the surface and how many of them to hold out; trust: (E,), 0 where missing."""
     voxels = np.abs(band.distance) / band.grid.used_spacing.max()
     inner = np.flatnonzero((trust > 0) & (voxels < SHELL[0]))
     shell = np.flatnonzero((trust > 0) & (voxels >= SHELL[0]) & (voxels < SHELL[1]))
-    return shell if len(shell) > len(inner) / 2 else inner  # data may end near the surface
+    valid, share = (shell, SHELL_SHARE) if len(shell) > len(inner) / 2 else (inner, NEAR_SHARE)
+    return valid, round(share * len(valid))
 
 
 def hold_out(band: Band, trust: np.ndarray, seed: int) -> np.ndarray:
     """Entries (H,) whose data are held out; raises DataError where too few voxels hold data."""
-    valid = can_hold_out(band, trust)
-    count = round(HELD_OUT * len(valid))
+    valid, count = can_hold_out(band, trust)
     if count < LEAST_HELD:
         raise DataError(
-            f"automatic choice: found {len(valid)} valid voxels beside the surface; expected at least {LEAST_VOXELS} "
-            "to hold some out; give --beta and --iterations"
+            f"automatic choice: found {len(valid)} valid voxels beside the surface, of which to hold out {count}; "
+            f"expected at least {LEAST_HELD}; give --beta and --iterations"
         )
     return np.sort(np.random.default_rng(seed).choice(valid, count, replace=False))
 
@@ -238,16 +237,26 @@ def discrepancy(course: Course, own: np.ndarray, trust: np.ndarray, sigma: float
     return lambda k, u: "discrepancy" if course.kind.spread(data, u[:, near]) >= sigma else None
 
 
-def decorrelated(course: Course, start: Extended, flow: Flow, beta: float, iterations: int) -> int:
-    """The iteration at which what the flow has removed is least correlated with what is left (Mrazek, Navara 2003)."""
-    near = np.flatnonzero(start.known & (np.abs(course.band.distance) < NEAR * course.band.grid.used_spacing.max()))
-    first = start.values[:, near].astype(float)
+def decorrelated(
+    course: Course, own: np.ndarray, trust: np.ndarray, start: Extended, flow: Flow, beta: float, iterations: int
+) -> int:
+    """The iteration at which what was removed from the data is least correlated with what is left.
+
+    Mrazek and Navara 2003.     own: (K, E) of weights trust (E,), not the start values, which are averages already.
+    Raises DataError where no valid voxel is near the surface.
+    """
+    near = near_surface(course.band, trust)
+    if not len(near):
+        raise DataError(
+            "stop decorrelation: found no valid voxel within half a voxel of the surface; give --iterations"
+        )
+    data = own[:, near].astype(float)
     found: list[float] = [np.inf]  # at the start nothing is removed
 
     def watch(k: int, u: np.ndarray) -> str | None:
         if k:
             left = u[:, near].astype(float)
-            removed = first - left
+            removed = data - left
             left, removed = (x - x.mean(1, keepdims=True) for x in (left, removed))
             size = np.sqrt((left**2).sum() * (removed**2).sum())
             found.append(abs(float((left * removed).sum())) / size if size > 0 else 0.0)

@@ -20,7 +20,7 @@ from beltrami_cli.flows import Flow, typical_slope
 from beltrami_cli.grid import Grid
 from beltrami_cli.kinds import Kind
 from beltrami_cli.phantoms import Phantom, torus
-from beltrami_cli.tuning import HELD_OUT, LAST_STEP, LEAST_VOXELS, SEARCH_RANGE, hold_out, search
+from beltrami_cli.tuning import LAST_STEP, LEAST_HELD, NEAR_SHARE, SEARCH_RANGE, SHELL_SHARE, hold_out, search
 
 DT = 0.15  # mm^2, the default on voxels of 1 mm
 CASES = [(map_, sigma) for map_ in ("smooth", "pieces", "mixed") for sigma in (10.0, 20.0, 40.0)]
@@ -96,7 +96,7 @@ def band() -> Band:
 def test_held_out_are_a_share_of_the_voxels_1_to_2_voxels_from_the_surface(band):
     held = hold_out(band, np.ones(band.entries), 0)
     shell = np.flatnonzero((np.abs(band.distance) >= 1) & (np.abs(band.distance) < 2))
-    assert len(held) == round(HELD_OUT * len(shell)) > 400
+    assert len(held) == round(SHELL_SHARE * len(shell)) > 400
     assert np.all(np.diff(held) > 0) and np.isin(held, shell).all()
     sides = (band.distance[held] > 0).mean()
     assert sides == pytest.approx((band.distance[shell] > 0).mean(), abs=0.05)
@@ -106,7 +106,7 @@ def test_held_out_by_seed(band):
     trust = np.ones(band.entries)
     first, again, other = (hold_out(band, trust, seed) for seed in (0, 0, 1))
     assert np.array_equal(first, again)
-    assert len(np.intersect1d(first, other)) == pytest.approx(HELD_OUT * len(first), rel=0.3)
+    assert len(np.intersect1d(first, other)) == pytest.approx(SHELL_SHARE * len(first), rel=0.3)
 
 
 def test_held_out_hold_data(band):
@@ -119,7 +119,7 @@ def test_held_out_beside_the_surface_where_data_end_there(band):
     trust = (np.abs(band.distance) < 1.05).astype(float)
     held = hold_out(band, trust, 0)
     inner = np.abs(band.distance) < 1
-    assert np.abs(band.distance[held]).max() < 1 and len(held) == round(HELD_OUT * inner.sum())
+    assert np.abs(band.distance[held]).max() < 1 and len(held) == round(NEAR_SHARE * inner.sum())
 
 
 def test_shell_counts_in_the_largest_voxels():
@@ -131,8 +131,8 @@ def test_shell_counts_in_the_largest_voxels():
 
 def test_too_few_to_hold_out(band):
     few = np.zeros(band.entries)
-    few[np.flatnonzero((np.abs(band.distance) > 1.2) & (np.abs(band.distance) < 1.8))[: LEAST_VOXELS - 5]] = 1
-    with pytest.raises(DataError, match=r"95 valid voxels.*at least 100.*--beta and --iterations"):
+    few[np.flatnonzero((np.abs(band.distance) > 1.2) & (np.abs(band.distance) < 1.8))[: 2 * LEAST_HELD - 4]] = 1
+    with pytest.raises(DataError, match=r"56 valid voxels.*hold out 28.*at least 30.*--beta and --iterations"):
         hold_out(band, few, 0)
 
 

