@@ -348,7 +348,7 @@ def test_too_few_voxels():
     kept = np.flatnonzero(np.abs(psi) < 0.5)[::5]
     few.flat[kept] = data.flat[kept]
     result = denoise(psi, few)
-    assert result.record["Choice"] is None and "fewer than 100 valid voxels" in result.warnings[0]
+    assert result.record["Choice"] is None and "too few valid voxels" in result.warnings[0]
     with pytest.raises(DataError, match="automatic choice: found"):
         denoise(psi, few, stop="auto")
 

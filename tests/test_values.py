@@ -437,20 +437,14 @@ def test_edge_is_the_inverse_of_beta():
 
 
 def test_colours_keep_common_edges():
-    """The colour of low contrast gains by what the others show; with one diffusivity for all, every one does."""
+    """With one diffusivity for all, every colour gains by what the others show, the one of low contrast most."""
     made = torus(32, map="pieces", noise=0.0)
     near = np.abs(made.levelset) < 0.5
     clean = np.stack([made.clean, 0.3 * made.clean, 255 - made.clean], -1)
     data = clean + 30 * np.random.default_rng(0).standard_normal(clean.shape)
-    gain = {}
-    for flow in ("beltrami", "phi"):
-        runs = (
-            denoise(made.levelset, data, kind="vector", independent=i, flow=flow, stop="auto") for i in (True, False)
-        )
-        apart, together = (np.sqrt(np.mean((r.data - clean)[near] ** 2, axis=0)) for r in runs)
-        gain[flow] = together / apart
-    assert gain["beltrami"][1] < 0.95
-    assert gain["phi"].max() < 0.99 and gain["phi"][1] < 0.9
+    runs = (denoise(made.levelset, data, kind="vector", independent=i, flow="phi", stop="auto") for i in (True, False))
+    apart, together = (np.sqrt(np.mean((r.data - clean)[near] ** 2, axis=0)) for r in runs)
+    assert (together / apart).max() < 0.97 and together[1] / apart[1] < 0.9
 
 
 # --- shapes -----------------------------------------------------------------------------------------------------------
