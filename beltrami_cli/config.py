@@ -23,6 +23,7 @@ STOPS = ("auto", "discrepancy", "decorrelation")
 DEFAULT_ITERATIONS = 20  # as in every example of the paper
 MOST_ITERATIONS = 10_000_000  # a typing error: days of work even on the smallest surface
 THINNEST_BAND = 1.5  # half-width in voxels of the largest spacing: a voxel at the surface, and its neighbours
+MOST_DEPTH = 50  # voxels: more than any cortex, and minutes of sampling
 DEFAULT_BAND = 4.0  # half-width in voxels of the largest spacing: the local cubic's stencil is whole inside it
 MOST_STEPS = 1000  # where the data end the run: at the default dt a Gaussian of about 40 voxels FWHM, 50 on a curve
 FWHM_TO_TIME = 1 / (16 * math.log(2))  # heat flow for t mm^2 is a Gaussian of FWHM sqrt(16 ln 2 t) mm
@@ -212,6 +213,8 @@ class Settings:
     def _require_numbers(self) -> None:
         for name in ("edge", "eps", "dt", "band", "noise_sigma"):
             _require_number(name, getattr(self, name), None)
+        if self.eps is not None and math.isinf(1 / self.eps):
+            raise RefusedError(f"eps: found {self.eps!r}, whose inverse is infinite; give a larger one")
         for name in ("time", "fwhm", "fill", "fidelity"):
             _require_number(name, getattr(self, name), 0.0)
         for name, lowest in (("iterations", 0), ("extend_every", 0), ("threads", 1)):
@@ -310,6 +313,11 @@ class Settings:
         """
         widest = float(spacing.max())
         reach = 0.0 if self.depth is None else max(map(abs, self.depth))
+        if reach > MOST_DEPTH * widest:
+            raise RefusedError(
+                f"depth: found {self.depth} on voxels of {widest:g} mm; expected at most {MOST_DEPTH} voxels to either "
+                "side: is it in mm?"
+            )
         if self.band is None:
             return max(DEFAULT_BAND * widest, reach + THINNEST_BAND * widest)
         if self.band < THINNEST_BAND * widest:
@@ -330,7 +338,7 @@ class Settings:
         Where the data end the run, the iterations are the most that it may take.
         """
         if self.stop is not None:
-            return MOST_STEPS, dt, self.stop
+            return MOST_STEPS, dt, "iterations" if self.stop == "discrepancy" else self.stop
         if self.time is None and self.fwhm is None:
             iterations = DEFAULT_ITERATIONS if self.iterations is None else self.iterations
             _require_countable("iterations", iterations)

@@ -10,7 +10,7 @@ import numpy as np
 from beltrami_cli.band import Band
 from beltrami_cli.evolve import Evolution, Observer, Schedule, Stop, evolve
 from beltrami_cli.extension import Extended, Reextension, extend
-from beltrami_cli.flows import Fidelity, Flow, Stepper
+from beltrami_cli.flows import MOST_SUBSTEPS, Fidelity, Flow, Stepper
 from beltrami_cli.kinds import Kind
 
 
@@ -46,16 +46,18 @@ class Course:
         schedule: Schedule,
         observer: Observer | None = None,
         stop: Stop | None = None,
+        most_substeps: int = MOST_SUBSTEPS,
     ) -> tuple[Evolution, int]:
         """Where `flow` leads from the start values, NaN where those are, and the most substeps that a step took."""
         u0 = start.values
         lost = np.isnan(u0[0])
         if lost.any():
             u0 = np.where(lost, 0, u0)  # linked to nothing but one another
-        pull = Fidelity(u0, (self.fidelity * start.confidence).astype(u0.dtype)) if self.fidelity else None
+        pull = Fidelity(u0, self.fidelity * start.confidence.astype(float)) if self.fidelity else None
         stepper = Stepper(
             flow, self.band, u0.dtype, len(u0),
             coupled=self.kind.name == "vector", unit=self.kind.unit, fidelity=pull,
+            most_substeps=most_substeps,
         )  # fmt: skip
         evolution = evolve(u0, stepper, schedule, self.reextension, self.extend_every, observer, stop)
         evolution.values[:, lost] = np.nan

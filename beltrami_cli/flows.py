@@ -98,8 +98,10 @@ class Stepper:
         coupled: bool = False,
         unit: float = 1.0,
         fidelity: Fidelity | None = None,
+        most_substeps: int = MOST_SUBSTEPS,
     ) -> None:
         self.flow, self.band, self.unit, self.fidelity = flow, band, unit, fidelity
+        self.most_substeps = most_substeps
         self.normal = np.ascontiguousarray(band.normal, dtype)
         self.spacing = band.grid.spacing.astype(dtype)
         self.flux, self.work = (np.empty((channels, 3, band.entries), dtype) for _ in range(2))
@@ -115,12 +117,12 @@ class Stepper:
         """Write u after one step of dt (mm^2) at beta (mm per data unit) into out, both (K, E).
 
         Returns (root mean square of the change, mean over entries of c |v|^2 / 2). Raises NumericsError where the
-        channels' metric would divide the step into more than MOST_SUBSTEPS.
+        channels' metric would divide the step into more than most_substeps.
         """
         source, left, taken, energy, squares = u, dt, 0, 0.0, 0.0
         while left > 0 or not taken:
             now, bound = self._fluxes(source, beta * self.unit)
-            if not bound <= MOST_SUBSTEPS:  # NaN, too
+            if not bound <= self.most_substeps:  # NaN, too
                 raise NumericsError(
                     f"a step at beta {beta:.4g} would have to be divided into {bound:.4g}: the channels' slopes are "
                     "far above 1/beta; give a smaller --beta"
@@ -133,7 +135,7 @@ class Stepper:
             source, left, taken = out, left * (1 - 1 / parts), taken + 1
         self.substeps = max(self.substeps, taken)
         if self.fidelity is not None:
-            with np.errstate(divide="ignore"):
+            with np.errstate(divide="ignore", over="ignore"):
                 share = (1 / (1 + 1 / (dt * self.fidelity.rate))).astype(u.dtype)
             out += share * (self.fidelity.target - out)
         if self.fidelity is not None or taken > 1:

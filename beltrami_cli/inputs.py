@@ -18,7 +18,9 @@ NEGATIVE_SHARE = 1e-3
 
 
 def require_usable(grid: Grid, name: str) -> None:
-    """Raise RefusedError where the voxel axes are not orthogonal."""
+    """Raise RefusedError where the voxel axes are not orthogonal, or fewer than two have more than one voxel."""
+    if len(grid.used_spacing) < 2:
+        raise RefusedError(f"{name}: found {' x '.join(map(str, grid.shape))} voxels; expected a volume or a plane")
     if grid.is_sheared():
         raise RefusedError(
             f"{name}: its voxel axes are not orthogonal (a sheared affine); expected a rectangular grid: "
@@ -97,6 +99,11 @@ def trusted(
     """
     trust = np.ones(grid.shape, settings.precision)
     if weights is not None:
+        if np.isposinf(weights).any():
+            raise RefusedError(
+                f"weights: found {int(np.isposinf(weights).sum())} infinite values; expected finite ones: a "
+                "variance of 0 is no certainty, put a lower bound on it"
+            )
         trust = np.where(np.isfinite(weights), weights, 0).astype(settings.precision)
         low, high = float(trust.min()), float(trust.max())
         if low < -NEGATIVE_SHARE * max(high, 0.0):
@@ -116,16 +123,17 @@ def trusted(
     return trust
 
 
-def finite_or_missing(data: np.ndarray, missing: float | None, warnings: Warnings) -> np.ndarray:
-    """Data whose infinite values, and those equal to `missing`, are NaN; raises DataError where nothing is left."""
-    data = without(data, missing)
+def finite_or_missing(data: np.ndarray, warnings: Warnings) -> np.ndarray:
+    """Data (E, ...) whose infinite values are NaN; raises DataError where nothing is left."""
     infinite = np.isinf(data)
     if not np.isfinite(data).any():
         found = "NaN and values that are infinite at this precision" if infinite.any() else "NaN"
-        found += "" if missing is None else f" and the missing value {missing:g}"
-        raise DataError(f"DATA has no valid value: found only {found}; expected finite values on the surface")
+        raise DataError(
+            f"the data have no valid value on the surface: found only {found} (or what --missing, --mask or weights of "
+            "0 exclude) beside the zero level, expected finite values there (do LEVELSET and DATA belong together?)"
+        )
     if infinite.any():
-        warnings.add(f"DATA has {int(infinite.sum())} infinite values: taken as missing")
+        warnings.add(f"DATA has {int(infinite.sum())} infinite values beside the surface: taken as missing")
         data = np.where(infinite, data.dtype.type(np.nan), data)
     return data
 
@@ -134,4 +142,5 @@ def without(data: np.ndarray, missing: float | None) -> np.ndarray:
     """Data with NaN where they equal the value that means missing."""
     if missing is None:
         return data
-    return np.where(data == data.dtype.type(missing), data.dtype.type(np.nan), data)
+    with np.errstate(over="ignore"):  # a value that this precision cannot hold is infinite in the data too
+        return np.where(data == data.dtype.type(missing), data.dtype.type(np.nan), data)

@@ -90,7 +90,7 @@ class Kind:
             return np.nan
         if not self.is_circular:
             return float(np.sqrt(np.mean(d**2)))
-        return float(self.unit * np.sqrt(-2 * np.log(max(float(np.mean(np.cos(d / self.unit))), 1e-12))))
+        return float(self.unit * np.sqrt(0.0 - 2 * np.log(max(float(np.mean(np.cos(d / self.unit))), 1e-12))))
 
     def errors(self, u: np.ndarray, data: np.ndarray) -> np.ndarray:
         """(...) squared error of channels u against data (K, ...): |u - data|^2, in data units.
@@ -106,17 +106,18 @@ class Kind:
 
 
 def kind_of(name: str, data: np.ndarray, period: float | None) -> tuple[Kind, str | None]:
-    """The kind of these data (nx, ny, nz[, K]), and a warning where an angle's period hardly fits them.
+    """The kind of these data (E,) or (E, K), and a warning where an angle's period hardly fits them.
 
     A vector of one channel is a scalar. Raises DataError where an angle's values span many periods.
     """
     if name != "circular":
-        single = data.ndim == 3 and not np.iscomplexobj(data)
+        single = data.ndim == 1 and not np.iscomplexobj(data)
         return Kind("scalar" if single else name, is_complex=np.iscomplexobj(data)), None
     assert period is not None
     finite = data[np.isfinite(data)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
-    kind = Kind(name, period, -period / 2 if low < 0 else 0.0)
+    signed = low < 0 and high <= period / 2 * (1 + 1e-6)
+    kind = Kind(name, period, -period / 2 if signed else 0.0)
     warning = None
     if high - low > period * (1 + 1e-3):
         warning = f"DATA run from {low:g} to {high:g}, more than one period of {period:g}: taken as wrapped angles"

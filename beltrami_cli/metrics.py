@@ -9,6 +9,9 @@ import numpy as np
 
 from beltrami_cli.errors import DataError, RefusedError
 
+# Length of the mean of unit vectors below which their mean direction is left to chance and outliers.
+SPREAD = 0.1
+
 
 @dataclass(frozen=True)
 class Difference:
@@ -119,9 +122,17 @@ def _correlation(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def _circular_correlation(x: np.ndarray, y: np.ndarray, period: float) -> float:
-    """The coefficient of Jammalamadaka and SenGupta: Pearson's with sines of deviations from the mean direction."""
-    turn = 2 * np.pi / period
-    p, q = (np.sin(turn * t - np.angle(np.exp(1j * turn * t).mean())) for t in (x, y))
+    """The coefficient of Jammalamadaka and SenGupta: Pearson's with sines of deviations from the mean direction.
+
+    Where the angles are spread over the circle that direction means nothing, and what is left is how far x - y agree
+    more than x + y: their form for uniform angles.
+    """
+    if np.ptp(x) == 0 or np.ptp(y) == 0:
+        return math.nan
+    a, b = (np.exp(2j * np.pi / period * t) for t in (x, y))
+    if min(abs(a.mean()), abs(b.mean())) < SPREAD:
+        return float(abs((a * b.conj()).mean()) - abs((a * b).mean()))
+    p, q = ((t * np.exp(-1j * np.angle(t.mean()))).imag for t in (a, b))
     return _normalised_product(p, q)
 
 

@@ -56,7 +56,7 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
                 assert solved.mesh is not None
                 formats.write_mesh(stage.path(path), solved.mesh)
         record = sidecar(job, sources, files.all, hashes, solved.record, tuple(warnings.lines), phases.seconds)
-        stage.path(files.sidecar).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        stage.path(files.sidecar).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         stage.commit()
     return replace(solved, record=record, warnings=tuple(warnings.lines))
 
@@ -67,7 +67,8 @@ def _denoise_volume(
     """The result, its volume written, and a volume of the grid and header that outputs are to have."""
     with phases("read"):
         psi = _read_levelset(job)
-        data = _onto(_read(job, job.data, channels=job.settings.kind == "vector"), psi, job, job.data)
+        data = _read(job, job.data, channels=job.settings.kind == "vector")
+        data = _onto(_that_counts(data, job), psi, job, f"DATA {job.data}", period=job.settings.period)
         if psi is not None and formats.volume_format(job.volume) != formats.volume_format(job.data):
             data = replace(data, header=psi.header)
     solver = _solver(job, psi, data.grid, phases, warnings)
@@ -91,7 +92,7 @@ def _denoise_series(
 
     def frame(t: int) -> np.ndarray:
         with phases("read"):
-            return _onto(Volume(series.frame(t), series.grid), psi, job, job.data).data
+            return _onto(_that_counts(Volume(series.frame(t), series.grid), job), psi, job, f"DATA {job.data}").data
 
     record: dict[str, Any] = {}
     at_vertices: list[np.ndarray] = []
@@ -114,11 +115,11 @@ def _denoise_series(
 def _solver(job: Job, psi: Volume | None, grid: Grid, phases: Phases, warnings: Warnings) -> Solver:
     with phases("read"):
         weights, mask = (
-            None if path is None else _onto(_read(job, path), psi, job, path, angles=False).data
-            for path in (job.weights, job.mask)
+            None if volume is None else _onto(volume, psi, job, name).data
+            for name, volume in (("weights", _read_weights(job)), ("mask", _read_mask(job)))
         )
     if mask is not None:
-        mask = np.nan_to_num(mask) >= (0.5 if job.resample else np.finfo(mask.dtype).tiny)
+        mask = np.nan_to_num(mask) >= 0.5  # between voxels, where it was moved
     return Solver(None if psi is None else psi.data, grid, job.settings, phases, warnings, weights, mask)
 
 
@@ -142,12 +143,14 @@ def mesh_of(
     if data is None:
         return surface_mesh(band)[0]
     flat = 1 in psi.grid.shape
-    volume = formats.read_volume(data, spacing=_spacing_for(data, spacing), channels=True, plane=flat)
+    several = period is None
+    volume = formats.read_volume(data, spacing=_spacing_for(data, spacing), channels=several, plane=several and flat)
     if bring:
         volume = resample(volume, psi.grid, period=period)
     require_same_grid(psi.grid, f"LEVELSET {levelset}", volume.grid, f"DATA {data}", remedy=REMEDY)
-    kind = kind_of("circular" if period else "vector", volume.data, period)[0]
-    own = own_samples(band, kind.to_channels(band.gather(plane.forth(volume.data))))
+    here = band.gather(plane.forth(volume.data))
+    kind = kind_of("circular" if period else "vector", here, period)[0]
+    own = own_samples(band, kind.to_channels(here))
     mesh, values = surface_mesh(band, own, turns=kind.turns)
     assert values is not None
     if not np.isfinite(values).any():
@@ -225,18 +228,42 @@ def _read_levelset(job: Job) -> Volume | None:
     return None if job.levelset is None else _read(job, job.levelset)
 
 
-def _onto(volume: Volume, psi: Volume | None, job: Job, path: Path, *, angles: bool = True) -> Volume:
+def _read_weights(job: Job) -> Volume | None:
+    return None if job.weights is None else _read(job, job.weights)
+
+
+def _read_mask(job: Job) -> Volume | None:
+    """1 where the mask is not 0."""
+    if job.mask is None:
+        return None
+    mask = _read(job, job.mask)
+    return mask.with_data((np.nan_to_num(mask.data) != 0).astype(mask.data.dtype))
+
+
+def _that_counts(data: Volume, job: Job) -> Volume:
+    """Data that are to be resampled, NaN where missing, and where a mask or weights on their own grid exclude them."""
+    if not job.resample:
+        return data
+    values = without(data.data, job.settings.missing).copy()
+    for other in (_read_weights(job), _read_mask(job)):
+        if other is not None and other.grid.matches(data.grid):
+            values[~(other.data > 0)] = np.nan
+    return replace(data, data=values)
+
+
+def _onto(volume: Volume, psi: Volume | None, job: Job, name: str, *, period: float | None = None) -> Volume:
     """The volume on the level set's grid; missing values are not mixed with others on the way."""
     if psi is None or not job.resample or volume.grid.matches(psi.grid):
         return volume
-    period = job.settings.period if angles else None
-    moved = resample(replace(volume, data=without(volume.data, job.settings.missing)), psi.grid, period=period)
+    moved = resample(volume, psi.grid, period=period)
     if not np.isfinite(moved.data).any():
         raise DataError(
-            f"{path}: has no value on the grid of {job.levelset}: found no overlap in world space, "
+            f"{name}: has no value on the grid of {job.levelset}: found no overlap in world space, "
             "expected volumes of one head in one space"
         )
-    return Volume(moved.data, psi.grid, psi.file_shape if moved.channels == 1 else (), psi.header)
+    if moved.channels > 1:  # what the header says of frames goes with them
+        return Volume(moved.data, psi.grid, (), volume.header)
+    return Volume(moved.data, psi.grid, psi.file_shape, psi.header)
 
 
 def _sha256(path: Path) -> str:

@@ -82,7 +82,9 @@ class Planner:
             self._doubt(choice, sample)
         if settings.stop == "decorrelation" and steps:
             with self.phases("choose"):
-                steps = decorrelated(course, sample.own, sample.trust, start, flow, beta, steps)
+                steps = decorrelated(course, sample.own, sample.trust, start, flow, beta, self.iterations)
+            if steps == self.iterations:
+                self.warnings.add(f"stop decorrelation: the correlation was still falling after {steps} iterations")
         return Plan(flow, Schedule(np.full(steps, beta), course.dt, self.ends_by), slope, noise, choice)
 
     def _fixed_beta(self, slope: float) -> float | None:
@@ -108,7 +110,7 @@ class Planner:
         if self.settings.flow == "auto":
             return True
         why = None
-        if can_hold_out(sample.course.band, sample.trust)[1] < LEAST_HELD:
+        if can_hold_out(sample.course, sample.trust)[1] < LEAST_HELD:
             why = "there are too few valid voxels beside the surface to hold some out"
         elif looks_correlated(sample.course.band, sample.own, sample.course.kind):
             why = f"{CORRELATED}, so that held-out ones would be predicted from their own copies"
@@ -136,7 +138,7 @@ class Planner:
                 f"automatic choice: {CORRELATED}: held-out ones are predicted from their own copies, and too little is "
                 f"smoothed; {way_out}"
             )
-        elif self.settings.stop == "auto" and not choice.is_clear:
+        elif self.settings.stop == "auto" and not choice.is_clear and not self.settings.flat:
             self.warnings.add(
                 "automatic choice: no run predicts the held-out voxels clearly better than the data as they are; "
                 + way_out

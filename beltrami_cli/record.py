@@ -95,6 +95,18 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
     }
 
 
+def over_frames(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    """What differs from frame to frame of a series; None for a frame without data, whose record is empty."""
+    return {
+        "without_data": [t for t, r in enumerate(records) if not r],
+        "noise_sd": [r["Noise"]["sd"][0] if r else None for r in records],
+        "removed_rms": [r["Removed"]["rms"] if r else None for r in records],
+        "iterations": [r["Iterations"] if r else None for r in records],
+        "filled_voxels": [r["Band"]["filled_voxels"] if r else None for r in records],
+        "missing_voxels": [r["Band"]["missing_voxels"] if r else None for r in records],
+    }
+
+
 def _used(settings: Settings, band: Band, plan: Plan, evolution: Evolution, kind: Kind) -> dict[str, Any]:
     """Every parameter as used, defaults and choices included."""
     flow, schedule = plan.flow, plan.schedule
@@ -143,7 +155,10 @@ def sidecar(
     """The record of a run on files, with names as in BIDS derivatives."""
     return {
         "GeneratedBy": [{"Name": "beltrami_cli", "Version": __version__}],
-        "Sources": [{"Path": os.fspath(path), "SHA256": digest} for path, digest in zip(sources, hashes, strict=True)],
+        "Sources": [
+            {"Path": os.fspath(path), "SHA256": digest, **_role(job, path)}
+            for path, digest in zip(sources, hashes, strict=True)
+        ],
         "Outputs": [os.fspath(file) for file in files],
         "Created": datetime.now(UTC).isoformat(timespec="seconds"),
         **happened,
@@ -152,6 +167,12 @@ def sidecar(
         "Seconds": {name: round(spent, 3) for name, spent in seconds.items()},
         "PeakMemoryMiB": _peak_memory_mib(),
     }
+
+
+def _role(job: Job, path: Path) -> dict[str, str]:
+    """What a source was to the run, where there is more to know than LEVELSET and DATA."""
+    roles = {"levelset": job.levelset, "data": job.data, "weights": job.weights, "mask": job.mask}
+    return next(({"Role": role} for role, file in roles.items() if file == path), {})
 
 
 def _peak_memory_mib() -> float | None:

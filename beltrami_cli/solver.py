@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,12 +18,21 @@ from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import Extended, own_samples
 from beltrami_cli.geodesic import distance_along
 from beltrami_cli.grid import Grid
-from beltrami_cli.inputs import PlaneLast, Warnings, band_of, finite_or_missing, require_usable, time_step, trusted
+from beltrami_cli.inputs import (
+    PlaneLast,
+    Warnings,
+    band_of,
+    finite_or_missing,
+    require_usable,
+    time_step,
+    trusted,
+    without,
+)
 from beltrami_cli.kinds import Kind, kind_of
-from beltrami_cli.noise import looks_correlated, smoothness_mm
+from beltrami_cli.noise import looks_correlated, noise_sd, smoothness_mm
 from beltrami_cli.planning import CORRELATED, Plan, Planner, Sample
 from beltrami_cli.progress import Phases
-from beltrami_cli.record import Ran, what_happened
+from beltrami_cli.record import Ran, over_frames, what_happened
 from beltrami_cli.sampling import surface_mesh
 from beltrami_cli.surface import Mesh
 from beltrami_cli.tuning import discrepancy
@@ -84,7 +94,7 @@ class Solver:
     def denoise(self, data: np.ndarray, observer: Observer | None = None) -> Result:
         """Denoise data of shape grid.shape, or grid.shape + (K,) for a vector."""
         sample = self._sample(data, self.warnings)
-        return self._run(data, sample, self.planner.plan(sample), observer)
+        return self._run(data, sample, self.planner.plan(sample), self.warnings, observer)
 
     def denoise_frames(
         self,
@@ -95,49 +105,64 @@ class Solver:
     ) -> Iterator[Result]:
         """Denoise `count` frames one after another, all with what is chosen on the middle one (that holds data).
 
-        frame: its number -> data of shape grid.shape. record: is given the middle one's record, with a list over all.
+        frame: its number -> data of shape grid.shape. record: is given the middle one's record, with lists over all.
         """
         chosen_on, sample = self._first_sample(count, frame)
         plan = self.planner.plan(sample)
-        quiet, empty, noise = Warnings(None), [], []
+        records: list[dict[str, Any]] = []
+        heard: Counter[str] = Counter()
         for t in range(count):
-            data = frame(t)
+            data, quiet = frame(t), Warnings(None)
             try:
                 sample = self._sample(data, quiet)
-                result = self._run(data, sample, plan if t == chosen_on else replace(plan, choice=None), observer)
-                noise.append(result.record["Noise"]["sd"][0])
             except DataError:
-                empty.append(t)
-                noise.append(None)
+                quiet.add("no valid data on the surface: left missing")
+                records.append({})
                 result = self._nothing(data)
-            if t == chosen_on:
-                record.update(result.record)
+            else:
+                noise = noise_sd(self.band, sample.own, sample.course.kind)
+                choice = plan.choice if t == chosen_on else None
+                result = self._run(data, sample, replace(plan, noise=noise, choice=choice), quiet, observer)
+                records.append(result.record)
+            heard.update(quiet.lines)
             yield result
-        if empty:
-            self.warnings.add(
-                f"{len(empty)} of {count} frames have no valid data on the surface: {empty[:10]}; left missing"
-            )
-        record["Frames"] = {"count": count, "chosen_on": chosen_on, "without_data": empty, "noise_sd": noise}
+        for line, frames in heard.items():
+            self.warnings.add(f"in {frames} of {count} frames: {line}")
+        record.update(records[chosen_on])
+        record["Frames"] = {"count": count, "chosen_on": chosen_on, **over_frames(records)}
 
     def _first_sample(self, count: int, frame: Callable[[int], np.ndarray]) -> tuple[int, Sample]:
-        """The frame to choose on, from the middle on the first that holds data; raises DataError where none does."""
+        """The frame to choose on: from the middle on the first with data that are not constant, or with any.
+
+        Raises DataError where none has data.
+        """
+        constant: tuple[int, Sample] | None = None
+        reason: DataError | None = None
         for t in [*range(count // 2, count), *range(count // 2)]:
             try:
-                return t, self._sample(frame(t), self.warnings)
+                sample = self._sample(frame(t), Warnings(None))
             except DataError as error:
                 reason = error
-        raise reason
+                continue
+            if np.nanmin(sample.own) < np.nanmax(sample.own):
+                return t, sample
+            constant = constant or (t, sample)
+        if constant is None:
+            assert reason is not None
+            raise reason
+        return constant
 
     def _sample(self, data: np.ndarray, warnings: Warnings) -> Sample:
         """The data as channels on the band; raises DataError where none are valid."""
-        data = finite_or_missing(data, self.settings.missing, warnings)
-        name = "scalar" if self.settings.independent else self.settings.kind
-        kind, doubt = kind_of(name, data, self.settings.period)
-        if doubt:
-            warnings.add(doubt)
         with self.phases("extend"):
-            channels = kind.to_channels(self.band.gather(self.plane.forth(data)))
-            own = own_samples(self.band, channels, every=self.settings.extension == "none")
+            here = without(self.band.gather(self.plane.forth(data)), self.settings.missing)
+            here[self.trust == 0] = np.nan
+            here = finite_or_missing(here, warnings)
+            name = "scalar" if self.settings.independent else self.settings.kind
+            kind, doubt = kind_of(name, here, self.settings.period)
+            if doubt:
+                warnings.add(doubt)
+            own = own_samples(self.band, kind.to_channels(here), every=self.settings.extension == "none")
             trust = np.where(np.isnan(own[0]), 0, self.trust).astype(own.dtype)
             own[:, trust == 0] = np.nan
             if kind != self.course.kind:  # else its re-extension is already prepared
@@ -149,7 +174,9 @@ class Solver:
             warnings.add(f"{share} of the band lies on parts of the surface without any data: left missing")
         return Sample(self.course, own, trust, start)
 
-    def _run(self, data: np.ndarray, sample: Sample, plan: Plan, observer: Observer | None) -> Result:
+    def _run(
+        self, data: np.ndarray, sample: Sample, plan: Plan, warnings: Warnings, observer: Observer | None
+    ) -> Result:
         settings, band, course, start = self.settings, self.band, sample.course, sample.start
         stop = None
         if settings.stop == "discrepancy" and plan.schedule.iterations:
@@ -157,7 +184,7 @@ class Solver:
             if not sigma > 0:
                 raise DataError("stop discrepancy: the noise cannot be estimated from these data; give --noise-sigma S")
             if settings.noise_sigma is None and looks_correlated(band, sample.own, course.kind):
-                self.warnings.add(f"stop discrepancy: {CORRELATED}, which hides its size; give it as --noise-sigma S")
+                warnings.add(f"stop discrepancy: {CORRELATED}, which hides its size; give it as --noise-sigma S")
             stop = discrepancy(course, sample.own, sample.trust, sigma)
         with self.phases("flow"):
             evolution, substeps = course.run(start, plan.flow, plan.schedule, observer, stop)
@@ -166,7 +193,12 @@ class Solver:
                 far = distance_along(band, start.known, settings.fill) > settings.fill
                 values[:, far & ~start.known] = np.nan
         if stop is not None and not evolution.iterations:
-            self.warnings.add("stop discrepancy: the start values are as far from the data as the noise: nothing to do")
+            warnings.add("stop discrepancy: the start values are as far from the data as the noise: nothing to do")
+        if stop is not None and evolution.stop_reason != "discrepancy":
+            warnings.add(
+                f"stop discrepancy: after {evolution.iterations} iterations less is removed than the noise: "
+                "is --noise-sigma in the unit of DATA?"
+            )
         with self.phases("mesh"):
             mesh = None
             if not settings.flat:

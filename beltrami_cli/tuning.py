@@ -23,9 +23,10 @@ from beltrami_cli.kinds import Kind
 
 # Half of the valid voxels 1 to 2 voxels from the surface are held out. Nearer ones make the start values, which would
 # miss them: where one is held out the flow has a gap to fill, and longer runs win that are too long for all data. Where
-# data end near the surface, a share of the nearer ones has to do.
+# the shell's own voxels enter the start (averages over depth), or data end before it, a smaller share has to do.
 SHELL = (1.0, 2.0)
 SHELL_SHARE, NEAR_SHARE = 0.5, 0.15
+FLAT_SHARE = 0.05  # without a surface every voxel is its own start value: few and far between
 LEAST_HELD = 30  # voxels, below which an error says nothing
 # A curve of error over iterations has passed its least value when it has gone on for a third as long again, and 6 more:
 # longer than from one re-extension to the next.
@@ -35,6 +36,7 @@ RIVAL = (1.5, 10)
 # Steps of the search over log2 beta: a factor of 4 until the least error lies between two larger ones, then 2 and 1.4.
 FIRST_STEP, LAST_STEP = 2.0, 0.5
 SEARCH_RANGE = 8.0  # |log2 (beta times the typical slope)|: beyond, a flow is l2, or stands still
+MOST_SUBSTEPS = 64  # parts of a step that a run of the path may take: an edge of 100 times 1 / beta takes half
 CLEAR = 3.0  # standard errors by which the chosen run must beat the start for the choice to mean something
 
 
@@ -91,18 +93,23 @@ class Choice:
         ]
 
 
-def can_hold_out(band: Band, trust: np.ndarray) -> tuple[np.ndarray, int]:
+def can_hold_out(course: Course, trust: np.ndarray) -> tuple[np.ndarray, int]:
     """Entries (N,) of voxels near the surface and how many of them to hold out; trust: (E,), 0 where missing."""
+    band = course.band
+    if band.surface is None:
+        valid = np.flatnonzero(trust > 0)
+        return valid, round(FLAT_SHARE * len(valid))
     voxels = np.abs(band.distance) / band.grid.used_spacing.max()
     inner = np.flatnonzero((trust > 0) & (voxels < SHELL[0]))
     shell = np.flatnonzero((trust > 0) & (voxels >= SHELL[0]) & (voxels < SHELL[1]))
-    valid, share = (shell, SHELL_SHARE) if len(shell) > len(inner) / 2 else (inner, NEAR_SHARE)
+    valid = shell if len(shell) > len(inner) / 2 else inner
+    share = SHELL_SHARE if valid is shell and course.depth is None else NEAR_SHARE
     return valid, round(share * len(valid))
 
 
-def hold_out(band: Band, trust: np.ndarray, seed: int) -> np.ndarray:
+def hold_out(course: Course, trust: np.ndarray, seed: int) -> np.ndarray:
     """Entries (H,) whose data are held out; raises DataError where too few voxels hold data."""
-    valid, count = can_hold_out(band, trust)
+    valid, count = can_hold_out(course, trust)
     if count < LEAST_HELD:
         raise DataError(
             f"automatic choice: found {len(valid)} valid voxels beside the surface, of which to hold out {count}; "
@@ -136,7 +143,7 @@ def choose(
     over beta starts. Without `stop`, runs are compared at their last iteration.
     Raises DataError where too few voxels hold data, NumericsError where no run stays within the finite numbers.
     """
-    held = hold_out(course.band, trust, seed)
+    held = hold_out(course, trust, seed)
     rest, left = own.copy(), trust.copy()
     rest[:, held], left[held] = np.nan, 0
     start = course.start(rest, left)
@@ -147,7 +154,9 @@ def choose(
         rival = min(curves, key=lambda c: c.error, default=None)
         watch = _Watch(course.kind, held, truth, weight, rival, to_end=not stop)
         try:
-            course.run(start, flow, Schedule(np.full(iterations, beta), course.dt), stop=watch)
+            course.run(
+                start, flow, Schedule(np.full(iterations, beta), course.dt), stop=watch, most_substeps=MOST_SUBSTEPS
+            )
         except NumericsError as error:  # channels so steep for this beta that a step would take minutes
             failures.append(error)
             watch.errors, watch.least = [np.inf], 0
@@ -240,9 +249,9 @@ def discrepancy(course: Course, own: np.ndarray, trust: np.ndarray, sigma: float
 def decorrelated(
     course: Course, own: np.ndarray, trust: np.ndarray, start: Extended, flow: Flow, beta: float, iterations: int
 ) -> int:
-    """The iteration at which what was removed from the data is least correlated with what is left.
+    """The iteration at which what was removed from the data is least correlated with what is left (Mrazek, Navara).
 
-    Mrazek and Navara 2003.     own: (K, E) of weights trust (E,), not the start values, which are averages already.
+    own: (K, E) of weights trust (E,), not the start values, which are averages already.
     Raises DataError where no valid voxel is near the surface.
     """
     near = near_surface(course.band, trust)

@@ -275,7 +275,7 @@ def test_how_long(scene, tmp_path, given, iterations, dt, reason):
 @pytest.mark.parametrize(
     "first, second",
     [
-        ("--flow beltrami", "--flow l2"),
+        ("--flow beltrami --beta 0.1", "--flow l2"),
         ("--flow beltrami", "--flow l1"),
         ("--flow l1", "--flow tv"),
         ("--flow phi --beta 0.1", "--flow phi --phi charbonnier --beta 0.1"),

@@ -21,7 +21,7 @@ def oblique_plane(size=24):
 
 def extended(band, data, method="closest-point", weights=None, **options) -> Extended:
     """The extension of a volume (nx, ny, nz), or of channels (nx, ny, nz, K), with weights (nx, ny, nz) or 1 each."""
-    own = own_samples(band, np.atleast_2d(band.gather(data).T).copy())
+    own = own_samples(band, np.atleast_2d(band.gather(data).T).copy(), every=method == "none")
     trust = np.ones(band.entries) if weights is None else band.gather(weights)
     trust = np.where(np.isnan(own[0]), 0, trust).astype(own.dtype)
     own[:, trust == 0] = np.nan

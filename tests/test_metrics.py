@@ -62,6 +62,13 @@ def test_angles_differ_the_short_way_round():
     assert np.allclose(wrapped(np.array([-0.6, 0.4, 0.5, 1.2]), 1.0), [0.4, 0.4, -0.5, 0.2])
 
 
+def test_angles_all_around_the_circle_correlate_with_themselves():
+    angles = np.linspace(0, 360, 720, endpoint=False)
+    turned = (angles + 3 * np.random.default_rng(0).standard_normal(720)) % 360
+    assert difference(angles, turned, period=360).correlation > 0.99
+    assert difference(angles, -angles % 360, period=360).correlation < -0.99
+
+
 def test_constant_data_have_no_correlation():
     d = difference(np.full(5, 2.0), np.arange(5.0))
     assert math.isnan(d.correlation) and d.as_dict()["correlation"] is None

@@ -27,7 +27,8 @@ def test_provenance(scene, tmp_path):
     used = record(tmp_path / "out.json")
     assert used["GeneratedBy"] == [{"Name": "beltrami_cli", "Version": beltrami_cli.__version__}]
     assert used["Sources"] == [
-        {"Path": str(path), "SHA256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in (levelset, data)
+        {"Path": str(path), "SHA256": hashlib.sha256(path.read_bytes()).hexdigest(), "Role": role}
+        for path, role in ((levelset, "levelset"), (data, "data"))
     ]
     assert used["Outputs"] == [str(tmp_path / f"out{s}") for s in (".nii.gz", ".surf.gii", ".func.gii", ".json")]
     assert timedelta(0) <= datetime.now(UTC) - datetime.fromisoformat(used["Created"]) < timedelta(minutes=1)

@@ -94,7 +94,7 @@ def band() -> Band:
 
 
 def test_held_out_are_a_share_of_the_voxels_1_to_2_voxels_from_the_surface(band):
-    held = hold_out(band, np.ones(band.entries), 0)
+    held = hold_out(Course(band, Kind(), 0.15), np.ones(band.entries), 0)
     shell = np.flatnonzero((np.abs(band.distance) >= 1) & (np.abs(band.distance) < 2))
     assert len(held) == round(SHELL_SHARE * len(shell)) > 400
     assert np.all(np.diff(held) > 0) and np.isin(held, shell).all()
@@ -104,7 +104,7 @@ def test_held_out_are_a_share_of_the_voxels_1_to_2_voxels_from_the_surface(band)
 
 def test_held_out_by_seed(band):
     trust = np.ones(band.entries)
-    first, again, other = (hold_out(band, trust, seed) for seed in (0, 0, 1))
+    first, again, other = (hold_out(Course(band, Kind(), 0.15), trust, seed) for seed in (0, 0, 1))
     assert np.array_equal(first, again)
     assert len(np.intersect1d(first, other)) == pytest.approx(SHELL_SHARE * len(first), rel=0.3)
 
@@ -112,12 +112,12 @@ def test_held_out_by_seed(band):
 def test_held_out_hold_data(band):
     trust = np.random.default_rng(0).random(band.entries).astype(np.float32)
     trust[trust < 0.6] = 0
-    assert np.all(trust[hold_out(band, trust, 0)] > 0)
+    assert np.all(trust[hold_out(Course(band, Kind(), 0.15), trust, 0)] > 0)
 
 
 def test_held_out_beside_the_surface_where_data_end_there(band):
     trust = (np.abs(band.distance) < 1.05).astype(float)
-    held = hold_out(band, trust, 0)
+    held = hold_out(Course(band, Kind(), 0.15), trust, 0)
     inner = np.abs(band.distance) < 1
     assert np.abs(band.distance[held]).max() < 1 and len(held) == round(NEAR_SHARE * inner.sum())
 
@@ -125,7 +125,7 @@ def test_held_out_beside_the_surface_where_data_end_there(band):
 def test_shell_counts_in_the_largest_voxels():
     psi = ball((24, 24, 24), 8.0)
     wide = build_band(psi, Grid.from_spacing(psi.shape, (0.5, 1.0, 1.0)), 4.0)
-    held = np.abs(wide.distance[hold_out(wide, np.ones(wide.entries), 0)])
+    held = np.abs(wide.distance[hold_out(Course(wide, Kind(), 0.15), np.ones(wide.entries), 0)])
     assert 1 <= held.min() < 1.1 and 1.9 < held.max() < 2
 
 
@@ -133,7 +133,7 @@ def test_too_few_to_hold_out(band):
     few = np.zeros(band.entries)
     few[np.flatnonzero((np.abs(band.distance) > 1.2) & (np.abs(band.distance) < 1.8))[: 2 * LEAST_HELD - 4]] = 1
     with pytest.raises(DataError, match=r"56 valid voxels.*hold out 28.*at least 30.*--beta and --iterations"):
-        hold_out(band, few, 0)
+        hold_out(Course(band, Kind(), 0.15), few, 0)
 
 
 # --- the search -------------------------------------------------------------------------------------------------------

@@ -176,7 +176,7 @@ def test_a_frame_without_data_stays_missing(empty):
     for t in {0, 1, 2} - {empty}:
         assert same(result.data[..., t], denoise(PSI, frames[..., t], beta=0.1).data)
     assert result.record["Frames"]["without_data"] == [empty]
-    assert any("1 of 3 frames have no valid data" in line for line in result.warnings)
+    assert any("in 1 of 3 frames: no valid data" in line for line in result.warnings)
 
 
 def test_a_voxel_missing_in_one_channel_is_missing_in_all():
@@ -241,7 +241,7 @@ def test_nothing_counts(name):
 
 
 def test_missing_everywhere():
-    with pytest.raises(DataError, match="missing value 7"):
+    with pytest.raises(DataError, match="found only NaN"):
         denoise(PSI, np.full(SHAPE, 7.0), missing=7)
 
 
@@ -472,3 +472,50 @@ def test_shapes_that_do_not_fit(data, options, word):
     with pytest.raises(RefusedError, match=word) as caught:
         denoise(PSI, data, **options)
     assert len(str(caught.value).splitlines()) == 1
+
+
+# --- what must not count ----------------------------------------------------------------------------------------------
+
+
+def test_angles_outside_the_mask_decide_neither_range_nor_period():
+    angle = np.where(NEAR, 180 + 100 * DIRECTION[0] + NOISE, -99999.0)
+    result = denoise(PSI, angle, mask=NEAR, kind="circular", period=360, beta=0.05)
+    assert result.record["Values"]["range"] == [0, 360] and result.warnings == ()
+    assert np.nanmin(result.data) >= 0 and np.nanmax(result.data) < 360
+
+
+def test_infinite_weights_are_refused():
+    with pytest.raises(RefusedError, match="infinite values; expected finite ones"):
+        denoise(PSI, WAVE, weights=np.where(DIRECTION[0] > 0, np.inf, 1.0))
+
+
+def test_every_frame_has_its_own_noise():
+    random = np.random.default_rng(3)
+    frames = np.stack([WAVE + sd * random.standard_normal(SHAPE) for sd in (2, 20, 5)], -1)
+    result = denoise(PSI, frames, kind="vector", independent=True, stop="discrepancy", beta=0.02)
+    found = result.record["Frames"]
+    assert found["noise_sd"] == pytest.approx([2, 20, 5], rel=0.2)
+    assert found["removed_rms"] == pytest.approx(found["noise_sd"], rel=0.25)
+    assert found["iterations"][1] > found["iterations"][0]
+
+
+def test_a_constant_frame_chooses_nothing_for_the_others():
+    frames = np.stack([WAVE + NOISE, 0 * WAVE, WAVE - NOISE], -1)
+    result = denoise(PSI, frames, kind="vector", independent=True, stop="auto")
+    assert result.record["Frames"]["chosen_on"] == 2 and result.record["Iterations"] > 0
+
+
+def test_discrepancy_that_is_never_reached_is_told():
+    result = denoise(PSI, WAVE + NOISE, flow="l2", stop="discrepancy", noise_sigma=1e6)
+    assert result.record["StopReason"] == "iterations" and result.record["Iterations"] == 1000
+    assert "less is removed than the noise" in result.warnings[0]
+
+
+def test_gross_outliers_in_a_channel_do_not_stall_the_choice():
+    random = np.random.default_rng(0)
+    data = np.stack([WAVE + NOISE, WAVE - NOISE], -1)
+    data[random.random(SHAPE) < 0.02] = 5000
+    result = denoise(PSI, data, kind="vector", stop="auto")
+    tried = sum(row["iterations_tried"] for row in result.record["Choice"]["table"])
+    assert result.record["PerIteration"]["most_substeps"] <= 64 and tried < 20_000
+    assert np.isfinite(result.data[NEAR]).all()

@@ -17,7 +17,7 @@ FILE = click.Path(path_type=Path)
 @click.argument("b", type=FILE)
 @click.option("--levelset", type=FILE, metavar="PSI", help="Compare only near the surface of this level set ...")
 @click.option("--within", type=float, metavar="MM", help="... within this distance. Default: half a voxel.")
-@click.option("--period", type=float, metavar="P", help="Values are angles of this period; differences wrap.")
+@click.option("--period", metavar="P", help="Values are angles of this period (360, 2pi, 24); differences wrap.")
 @click.option("--max-abs", type=float, metavar="X", help="Tolerance: the largest difference.")
 @click.option("--max-rms", type=float, metavar="X", help="Tolerance: the root mean square difference.")
 @click.option("--min-psnr", type=float, metavar="X", help="Tolerance: peak signal to noise in dB, over --data-range.")
@@ -28,7 +28,7 @@ def compare(
     b: Path,
     levelset: Path | None,
     within: float | None,
-    period: float | None,
+    period: str | None,
     max_abs: float | None,
     max_rms: float | None,
     min_psnr: float | None,
@@ -38,13 +38,16 @@ def compare(
     verbose: int,
 ) -> int:
     """Compare volume B with the reference A where both have values; exit 1 where a tolerance is broken."""
+    from beltrami_cli.config import parse_period
     from beltrami_cli.inspection import compare_volumes
 
     if within is not None and levelset is None:
         raise click.UsageError("--within needs --levelset, the surface to be near to")
     if levelset is not None:
         announce_compilation(quiet)
-    found = compare_volumes(a, b, levelset=levelset, within=within, period=period, data_range=data_range)
+    found = compare_volumes(
+        a, b, levelset=levelset, within=within, period=parse_period(period) if period else None, data_range=data_range
+    )
     broken = found.exceeds(max_abs=max_abs, max_rms=max_rms, min_psnr=min_psnr)
     if as_json:
         say(quiet, json.dumps({**found.as_dict(), "broken": broken}, indent=2))
