@@ -55,7 +55,9 @@ class Denoise(Command):
 @click.option("--weights", type=FILE, help="How much each voxel of DATA counts: R^2, coherence ...; 0 or more.")
 @click.option("--mask", type=FILE, help="Which voxels of DATA count: those where it is not 0. All else is missing.")
 @click.option("--spacing", metavar="S|SX,SY,SZ", help="Voxel size in mm of .npy inputs. Default: 1.")
-@click.option("--resample", is_flag=True, default=None, help="Bring DATA onto LEVELSET's grid (trilinear).")
+@click.option(
+    "--resample", is_flag=True, default=None, help="Bring DATA, weights and mask onto LEVELSET's grid (trilinear)."
+)
 @click.option("--config", type=FILE, help="A TOML file with any of this; the command line overrides it.")
 @overwrite_option
 @click.option(
@@ -76,7 +78,9 @@ class Denoise(Command):
 )
 @click.option("--edge", type=float, metavar="SLOPE", help="The same as a slope in data units per mm: beta = 1/SLOPE.")
 @click.option(
-    "--eps", type=float, help="Slope (data units per mm) under which l1 and tv smooth. Default: a tenth of median."
+    "--eps",
+    type=float,
+    help="Slope (data units per mm) under which l1 and tv smooth. Default: a tenth of the data's median slope.",
 )
 @click.option(
     "--scheme",
@@ -108,12 +112,18 @@ class Denoise(Command):
 @click.option(
     "--kind",
     type=click.Choice(["scalar", "circular", "vector"]),
-    help="circular: angles, which wrap. vector: the last axis of DATA holds channels, whose edges are shared. "
+    help="circular: angles, which wrap. vector: the last axis of DATA (in a plane the third) holds channels, whose edges "
+    "are shared. "
     "Default: scalar.",
 )
 @click.option("--period", metavar="P", help="Of circular data, in their unit: 360, 2pi, 24 ...")
 @click.option("--independent", is_flag=True, default=None, help="A vector's channels run apart, as scalars do.")
-@click.option("--missing", type=float, metavar="VALUE", help="A value of DATA that means none, as NaN always does.")
+@click.option(
+    "--missing",
+    type=float,
+    metavar="VALUE",
+    help="A value of DATA that means none, as NaN always does; in one channel, for all.",
+)
 @click.option(
     "--fill", type=float, metavar="MM", help="Fill in no farther than this along the surface. Default: no limit."
 )
