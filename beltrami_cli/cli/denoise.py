@@ -112,8 +112,8 @@ class Denoise(Command):
 @click.option(
     "--kind",
     type=click.Choice(["scalar", "circular", "vector"]),
-    help="circular: angles, which wrap. vector: the last axis of DATA (in a plane the third) holds channels, whose edges "
-    "are shared. "
+    help="circular: angles, which wrap. vector: the last axis of DATA (in a plane the third) holds channels, whose "
+    "edges are shared. "
     "Default: scalar.",
 )
 @click.option("--period", metavar="P", help="Of circular data, in their unit: 360, 2pi, 24 ...")
