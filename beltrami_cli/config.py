@@ -115,8 +115,9 @@ def parse_period(given: Any) -> float:
 
 def parse_depth(given: Any) -> tuple[float, float]:
     """(A, B) in mm along the normal, A <= B, from "A:B" or a list of two; raises RefusedError for anything else."""
+    parts = given.tolist() if isinstance(given, np.ndarray) else given
     try:
-        first, last = _numbers(given.split(":") if isinstance(given, str) else given)
+        first, last = _numbers(parts.split(":") if isinstance(parts, str) else parts)
     except (TypeError, ValueError):
         first = last = math.nan
     if not (math.isfinite(first) and math.isfinite(last) and first <= last):

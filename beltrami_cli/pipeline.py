@@ -17,7 +17,7 @@ from beltrami_cli.config import Job, Settings
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import own_samples
-from beltrami_cli.grid import Grid, Volume, require_same_grid
+from beltrami_cli.grid import Grid, Volume, require_same_grid, with_channels
 from beltrami_cli.inputs import PlaneLast, Warnings, band_of, require_usable, time_step, without
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.progress import Phases
@@ -109,7 +109,8 @@ def _denoise_series(
 
     formats.write_series(stage.path(job.volume), like, denoised(), dtype=job.settings.precision)
     mesh = replace(meshes[0], values=np.stack(at_vertices, -1)) if meshes else None
-    return Result(np.empty(0), mesh, filled, record, ()), Volume(filled, like.grid, header=like.header)
+    as_stored = with_channels(series.file_shape, series.count, 1) if like.grid.shape == series.grid.shape else ()
+    return Result(np.empty(0), mesh, filled, record, ()), Volume(filled, like.grid, as_stored, like.header)
 
 
 def _solver(job: Job, psi: Volume | None, grid: Grid, phases: Phases, warnings: Warnings) -> Solver:

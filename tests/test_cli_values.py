@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from command import beltrami, contents, done, refused
+from command import ball, beltrami, contents, done, nifti, noisy, refused, seen
 
 from beltrami_cli import pipeline
 from beltrami_cli.cli.denoise import summary
@@ -228,3 +228,21 @@ def test_verbose_prints_the_table_of_the_choice(scene, monkeypatch):
     assert "held out: l2, 7 iterations: error 12.346\n" in run.err
     assert "held out: perona-malik, beta 0.5, 9 iterations: error 11\n" in run.err
     assert run.out.splitlines()[2] == "chosen by held-out data: perona-malik, beta 0.5, 9 iterations"
+
+
+def test_what_the_mask_excludes_is_not_mixed_in_by_resampling(tmp_path):
+    moved = np.eye(4)
+    moved[:3, 3] = 0.6
+    counts = np.abs(ball()) < 3
+    levelset = nifti(tmp_path / "psi.nii.gz", ball())
+    data = nifti(tmp_path / "data.nii.gz", np.where(counts, noisy(), 1e5).astype(np.float32), moved)
+    mask = nifti(tmp_path / "mask.nii.gz", np.where(counts, -3, 0).astype(np.float32), moved)
+    out = tmp_path / "out.nii.gz"
+    done("denoise", levelset, data, "-o", out, "--mask", mask, "--resample", "--beta", "0.05")
+    assert seen(out).max() < 100
+
+
+def test_angles_of_several_channels_make_no_mesh(scene, tmp_path):
+    levelset, _, _ = scene
+    data = nifti(tmp_path / "four.nii.gz", np.stack([noisy(), noisy()], -1))
+    assert "one number per voxel" in refused("mesh", levelset, data, "-o", tmp_path / "m.ply", "--period", "360")
