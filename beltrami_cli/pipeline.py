@@ -66,12 +66,12 @@ def _denoise_volume(
 ) -> tuple[Result, Volume]:
     """The result, its volume written, and a volume of the grid and header that outputs are to have."""
     with phases("read"):
-        psi = _read_levelset(job)
+        psi, trust = _read_levelset(job), _read_trust(job)
         data = _read(job, job.data, channels=job.settings.kind == "vector")
-        data = _onto(_that_counts(data, job), psi, job, f"DATA {job.data}", period=job.settings.period)
+        data = _onto(_that_counts(data, trust, job), psi, job, f"DATA {job.data}", period=job.settings.period)
         if psi is not None and formats.volume_format(job.volume) != formats.volume_format(job.data):
             data = replace(data, header=psi.header)
-    solver = _solver(job, psi, data.grid, phases, warnings)
+    solver = _solver(job, psi, trust, data.grid, phases, warnings)
     solved = solver.denoise(data.data, observer)
     with phases("write"):
         formats.write_volume(stage.path(job.volume), data.with_data(solved.data), dtype=job.settings.precision)
@@ -83,16 +83,17 @@ def _denoise_series(
 ) -> tuple[Result, Volume]:
     """As `_denoise_volume`, frame by frame."""
     with phases("read"):
-        psi = _read_levelset(job)
+        psi, trust = _read_levelset(job), _read_trust(job)
         series = formats.open_series(
             job.data, spacing=_spacing_for(job.data, job.spacing), dtype=job.settings.precision, plane=_is_plane(job)
         )
     like = series if psi is None else replace(series, grid=psi.grid)
-    solver = _solver(job, psi, like.grid, phases, warnings)
+    solver = _solver(job, psi, trust, like.grid, phases, warnings)
 
     def frame(t: int) -> np.ndarray:
         with phases("read"):
-            return _onto(_that_counts(Volume(series.frame(t), series.grid), job), psi, job, f"DATA {job.data}").data
+            data = _that_counts(Volume(series.frame(t), series.grid), trust, job)
+            return _onto(data, psi, job, f"DATA {job.data}").data
 
     record: dict[str, Any] = {}
     at_vertices: list[np.ndarray] = []
@@ -113,12 +114,12 @@ def _denoise_series(
     return Result(np.empty(0), mesh, filled, record, ()), Volume(filled, like.grid, as_stored, like.header)
 
 
-def _solver(job: Job, psi: Volume | None, grid: Grid, phases: Phases, warnings: Warnings) -> Solver:
+def _solver(
+    job: Job, psi: Volume | None, trust: dict[str, Volume], grid: Grid, phases: Phases, warnings: Warnings
+) -> Solver:
     with phases("read"):
-        weights, mask = (
-            None if volume is None else _onto(volume, psi, job, name).data
-            for name, volume in (("weights", _read_weights(job)), ("mask", _read_mask(job)))
-        )
+        here = {name: _onto(volume, psi, job, name).data for name, volume in trust.items()}
+        weights, mask = here.get("weights"), here.get("mask")
     if mask is not None:
         mask = np.nan_to_num(mask) >= 0.5  # between voxels, where it was moved
     return Solver(None if psi is None else psi.data, grid, job.settings, phases, warnings, weights, mask)
@@ -229,25 +230,24 @@ def _read_levelset(job: Job) -> Volume | None:
     return None if job.levelset is None else _read(job, job.levelset)
 
 
-def _read_weights(job: Job) -> Volume | None:
-    return None if job.weights is None else _read(job, job.weights)
+def _read_trust(job: Job) -> dict[str, Volume]:
+    """What says how much data count: "weights" as they are, "mask" as 1 where it is not 0; those there are."""
+    trust = {}
+    if job.weights is not None:
+        trust["weights"] = _read(job, job.weights)
+    if job.mask is not None:
+        mask = _read(job, job.mask)
+        trust["mask"] = mask.with_data((np.nan_to_num(mask.data) != 0).astype(mask.data.dtype))
+    return trust
 
 
-def _read_mask(job: Job) -> Volume | None:
-    """1 where the mask is not 0."""
-    if job.mask is None:
-        return None
-    mask = _read(job, job.mask)
-    return mask.with_data((np.nan_to_num(mask.data) != 0).astype(mask.data.dtype))
-
-
-def _that_counts(data: Volume, job: Job) -> Volume:
+def _that_counts(data: Volume, trust: dict[str, Volume], job: Job) -> Volume:
     """Data that are to be resampled, NaN where missing, and where a mask or weights on their own grid exclude them."""
     if not job.resample:
         return data
     values = without(data.data, job.settings.missing).copy()
-    for other in (_read_weights(job), _read_mask(job)):
-        if other is not None and other.grid.matches(data.grid):
+    for other in trust.values():
+        if other.grid.matches(data.grid):
             values[~(other.data > 0)] = np.nan
     return replace(data, data=values)
 

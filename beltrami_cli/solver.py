@@ -121,6 +121,7 @@ class Solver:
                 result = self._nothing(data)
             else:
                 noise = noise_sd(self.band, sample.own, sample.course.kind)
+                noise = np.where(np.isnan(noise), plan.noise, noise)  # too few voxels to tell: as where it was chosen
                 choice = plan.choice if t == chosen_on else None
                 result = self._run(data, sample, replace(plan, noise=noise, choice=choice), quiet, observer)
                 records.append(result.record)
@@ -181,7 +182,7 @@ class Solver:
         stop = None
         if settings.stop == "discrepancy" and plan.schedule.iterations:
             sigma = settings.noise_sigma or float(np.sqrt(np.mean(plan.noise**2)))
-            if not sigma > 0:
+            if not sigma >= 0:
                 raise DataError("stop discrepancy: the noise cannot be estimated from these data; give --noise-sigma S")
             if settings.noise_sigma is None and looks_correlated(band, sample.own, course.kind):
                 warnings.add(f"stop discrepancy: {CORRELATED}, which hides its size; give it as --noise-sigma S")

@@ -519,3 +519,10 @@ def test_gross_outliers_in_a_channel_do_not_stall_the_choice():
     tried = sum(row["iterations_tried"] for row in result.record["Choice"]["table"])
     assert result.record["PerIteration"]["most_substeps"] <= 64 and tried < 20_000
     assert np.isfinite(result.data[NEAR]).all()
+
+
+def test_a_constant_frame_does_not_stop_a_series_under_discrepancy():
+    frames = np.stack([WAVE + NOISE, WAVE - NOISE, 0 * WAVE], -1)
+    result = denoise(PSI, frames, kind="vector", independent=True, stop="discrepancy", beta=0.02)
+    assert result.record["Frames"]["iterations"][2] == 0 and (result.data[NEAR][:, 2] == 0).all()
+    assert result.record["Frames"]["iterations"][0] > 0
