@@ -25,7 +25,6 @@ class Course:
     band: Band
     kind: Kind
     dt: float
-    scheme: str = "symmetric"
     extension: str = "closest-point"
     depth: tuple[float, float] | None = None
     extend_every: int = 5

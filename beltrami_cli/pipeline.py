@@ -40,6 +40,7 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
     phases, warnings = Phases(), Warnings(notify)
     grid = _check_grids(job)
     files = _Files(job, curve=1 in grid.shape)
+    plane = _is_plane(job, grid)
     sources = [file for path in job.all_inputs for file in formats.input_files(path)]
     with formats.Stage(files.all, overwrite=job.overwrite, inputs=sources) as stage:
         with phases("numba"):
@@ -47,7 +48,7 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
         with ThreadPoolExecutor(1) as pool:
             digests = pool.submit(lambda: [_sha256(path) for path in sources])
             work = _denoise_series if job.settings.independent else _denoise_volume
-            solved, like = work(job, stage, phases, warnings, observer)
+            solved, like = work(job, plane, stage, phases, warnings, observer)
             hashes = digests.result()
         with phases("write"):
             if job.filled is not None:
@@ -62,12 +63,12 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
 
 
 def _denoise_volume(
-    job: Job, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
+    job: Job, plane: bool, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
 ) -> tuple[Result, Volume]:
     """The result, its volume written, and a volume of the grid and header that outputs are to have."""
     with phases("read"):
         psi, trust = _read_levelset(job), _read_trust(job)
-        data = _read(job, job.data, channels=job.settings.kind == "vector")
+        data = _read(job, job.data, channels=job.settings.kind == "vector", plane=plane)
         data = _onto(_that_counts(data, trust, job), psi, job, f"DATA {job.data}", period=job.settings.period)
         if psi is not None and formats.volume_format(job.volume) != formats.volume_format(job.data):
             data = replace(data, header=psi.header)
@@ -79,13 +80,13 @@ def _denoise_volume(
 
 
 def _denoise_series(
-    job: Job, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
+    job: Job, plane: bool, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
 ) -> tuple[Result, Volume]:
     """As `_denoise_volume`, frame by frame."""
     with phases("read"):
         psi, trust = _read_levelset(job), _read_trust(job)
         series = formats.open_series(
-            job.data, spacing=_spacing_for(job.data, job.spacing), dtype=job.settings.precision, plane=_is_plane(job)
+            job.data, spacing=_spacing_for(job.data, job.spacing), dtype=job.settings.precision, plane=plane
         )
     like = series if psi is None else replace(series, grid=psi.grid)
     solver = _solver(job, psi, trust, like.grid, phases, warnings)
@@ -185,14 +186,10 @@ def _check_grids(job: Job) -> Grid:
         ("LEVELSET", "DATA", "weights", "mask"), (job.levelset, job.data, job.weights, job.mask), strict=True
     ):
         if path is not None:
-            is_data = name == "DATA"
-            found = formats.read_grid(
-                path,
-                spacing=_spacing_for(path, job.spacing),
-                channels=is_data and several,
-                plane=is_data and _is_plane(job),
-            )
-            grids[name] = path, found
+            channels = several and name == "DATA"
+            plane = channels and _is_plane(job, grids["LEVELSET"][1] if "LEVELSET" in grids else None)
+            steps = _spacing_for(path, job.spacing)
+            grids[name] = path, formats.read_grid(path, spacing=steps, channels=channels, plane=plane)
     first, (where, grid) = next(iter(grids.items()))
     for name, (path, other) in grids.items():
         if not job.resample:
@@ -201,29 +198,25 @@ def _check_grids(job: Job) -> Grid:
     job.settings.duration(time_step(grid, job.settings))
     if not job.settings.flat:
         job.settings.half_width(grid.used_spacing)
-    layout = formats.read_layout(job.data, plane=_is_plane(job)) if several else (1, False)
+    layout = formats.read_layout(job.data, plane=_is_plane(job, grid)) if several else (1, False)
     formats.require_writable(job.volume, grid, channels=layout[0], is_complex=layout[1])
     if job.filled is not None:
         formats.require_writable(job.filled, grid)
     return grid
 
 
-def _is_plane(job: Job) -> bool:
-    """True where DATA of three axes are a plane of channels: its level set is one, or it is a picture."""
-    if job.levelset is None:
-        return True
-    return 1 in formats.read_grid(job.levelset, spacing=_spacing_for(job.levelset, job.spacing)).shape
+def _is_plane(job: Job, grid: Grid | None) -> bool:
+    """True where DATA of three axes are a plane of channels: its level set, on `grid`, is one, or it is a picture."""
+    return job.levelset is None or (grid is not None and 1 in grid.shape)
 
 
 def _spacing_for(path: Path, spacing: tuple[float, ...] | None) -> tuple[float, ...] | None:
     return spacing if formats.volume_format(path) == "NPY" else None
 
 
-def _read(job: Job, path: Path, *, channels: bool = False) -> Volume:
-    return formats.read_volume(
-        path, spacing=_spacing_for(path, job.spacing), dtype=job.settings.precision, channels=channels,
-        plane=channels and _is_plane(job),
-    )  # fmt: skip
+def _read(job: Job, path: Path, *, channels: bool = False, plane: bool = False) -> Volume:
+    steps = _spacing_for(path, job.spacing)
+    return formats.read_volume(path, spacing=steps, dtype=job.settings.precision, channels=channels, plane=plane)
 
 
 def _read_levelset(job: Job) -> Volume | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -29,6 +30,16 @@ class Sample:
     own: np.ndarray
     trust: np.ndarray
     start: Extended
+
+    @cached_property
+    def noise(self) -> np.ndarray:
+        """Standard deviations, (K,) or (1,), as `noise.noise_sd` finds them."""
+        return noise_sd(self.course.band, self.own, self.course.kind)
+
+    @cached_property
+    def looks_correlated(self) -> bool:
+        """True where the noise of neighbouring voxels is alike, see `noise.looks_correlated`."""
+        return looks_correlated(self.course.band, self.own, self.course.kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +74,10 @@ class Planner:
         """Which flow, and its schedule, by the settings and, where they say so, by the data; raises as `denoise`."""
         settings, course, start = self.settings, sample.course, sample.start
         slope = typical_slope(sample.course.band, start.values, start.known) * course.kind.unit
-        noise = noise_sd(sample.course.band, sample.own, course.kind)
         flow = Flow("beltrami" if settings.flow == "auto" else settings.flow, settings.phi_name, settings.scheme)
         if len(settings.beta.values) > 1:
             schedule = Schedule(settings.beta.over(self.iterations), course.dt, self.ends_by)
-            return Plan(flow, schedule, slope, noise, None)
+            return Plan(flow, schedule, slope, sample.noise, None)
         fixed, steps, choice = self._fixed_beta(slope), self.iterations, None
         beta = fixed if fixed is not None else 1 / slope if slope else 0.0
         if not slope:  # constant data: nothing to choose, and nothing to flow
@@ -85,7 +95,7 @@ class Planner:
                 steps = decorrelated(course, sample.own, sample.trust, start, flow, beta, self.iterations)
             if steps == self.iterations:
                 self.warnings.add(f"stop decorrelation: the correlation was still falling after {steps} iterations")
-        return Plan(flow, Schedule(np.full(steps, beta), course.dt, self.ends_by), slope, noise, choice)
+        return Plan(flow, Schedule(np.full(steps, beta), course.dt, self.ends_by), slope, sample.noise, choice)
 
     def _fixed_beta(self, slope: float) -> float | None:
         """beta in mm per data unit where it is given, None where it is to be chosen."""
@@ -112,7 +122,7 @@ class Planner:
         why = None
         if can_hold_out(sample.course, sample.trust)[1] < LEAST_HELD:
             why = "there are too few valid voxels beside the surface to hold some out"
-        elif looks_correlated(sample.course.band, sample.own, sample.course.kind):
+        elif sample.looks_correlated:
             why = f"{CORRELATED}, so that held-out ones would be predicted from their own copies"
         if why:
             self.warnings.add(f"beta auto: {why}: beta is 1 / the data's median slope; give --beta or --edge")
@@ -133,7 +143,7 @@ class Planner:
     def _doubt(self, choice: Choice, sample: Sample) -> None:
         """Warn where held-out data are a poor judge."""
         way_out = "look at the result, or use --stop discrepancy with --noise-sigma S"
-        if looks_correlated(sample.course.band, sample.own, sample.course.kind):
+        if sample.looks_correlated:
             self.warnings.add(
                 f"automatic choice: {CORRELATED}: held-out ones are predicted from their own copies, and too little is "
                 f"smoothed; {way_out}"

@@ -50,7 +50,7 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
     near = near[~np.isnan(ran.values[0, near])]
     beta = schedule.beta[: evolution.iterations]
     return {
-        "Parameters": _used(settings, band, plan, evolution, ran.kind),
+        "Parameters": _used(settings, band, plan, evolution),
         "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
         "Band": {
             "voxels": len(primary),
@@ -107,7 +107,7 @@ def over_frames(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
     }
 
 
-def _used(settings: Settings, band: Band, plan: Plan, evolution: Evolution, kind: Kind) -> dict[str, Any]:
+def _used(settings: Settings, band: Band, plan: Plan, evolution: Evolution) -> dict[str, Any]:
     """Every parameter as used, defaults and choices included."""
     flow, schedule = plan.flow, plan.schedule
     one = len(set(schedule.beta.tolist())) == 1
@@ -170,7 +170,7 @@ def sidecar(
 
 
 def _role(job: Job, path: Path) -> dict[str, str]:
-    """What a source was to the run, where there is more to know than LEVELSET and DATA."""
+    """What a source was to the run; nothing for the second file of a pair."""
     roles = {"levelset": job.levelset, "data": job.data, "weights": job.weights, "mask": job.mask}
     return next(({"Role": role} for role, file in roles.items() if file == path), {})
 

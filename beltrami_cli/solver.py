@@ -29,7 +29,7 @@ from beltrami_cli.inputs import (
     without,
 )
 from beltrami_cli.kinds import Kind, kind_of
-from beltrami_cli.noise import looks_correlated, noise_sd, smoothness_mm
+from beltrami_cli.noise import smoothness_mm
 from beltrami_cli.planning import CORRELATED, Plan, Planner, Sample
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import Ran, over_frames, what_happened
@@ -87,7 +87,7 @@ class Solver:
             self.band = band_of(psi, settings, self.plane, warnings)
             self.trust = self.band.gather(self.plane.forth(trust))
             self.course = Course(
-                self.band, Kind(), dt, settings.scheme, settings.extension, settings.depth, settings.reextends_every,
+                self.band, Kind(), dt, settings.extension, settings.depth, settings.reextends_every,
                 settings.fidelity or 0.0,
             )  # fmt: skip
 
@@ -120,8 +120,9 @@ class Solver:
                 records.append({})
                 result = self._nothing(data)
             else:
-                noise = noise_sd(self.band, sample.own, sample.course.kind)
-                noise = np.where(np.isnan(noise), plan.noise, noise)  # too few voxels to tell: as where it was chosen
+                noise = np.where(
+                    np.isnan(sample.noise), plan.noise, sample.noise
+                )  # too few voxels to tell: as where it was chosen
                 choice = plan.choice if t == chosen_on else None
                 result = self._run(data, sample, replace(plan, noise=noise, choice=choice), quiet, observer)
                 records.append(result.record)
@@ -184,7 +185,7 @@ class Solver:
             sigma = settings.noise_sigma or float(np.sqrt(np.mean(plan.noise**2)))
             if not sigma >= 0:
                 raise DataError("stop discrepancy: the noise cannot be estimated from these data; give --noise-sigma S")
-            if settings.noise_sigma is None and looks_correlated(band, sample.own, course.kind):
+            if settings.noise_sigma is None and sample.looks_correlated:
                 warnings.add(f"stop discrepancy: {CORRELATED}, which hides its size; give it as --noise-sigma S")
             stop = discrepancy(course, sample.own, sample.trust, sigma)
         with self.phases("flow"):

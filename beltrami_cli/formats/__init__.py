@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -50,6 +51,7 @@ _VOLUMES = {
     ".mgh": "MGH",
     ".png": "PNG",
 }
+_MODULES = {"NIfTI": nifti, "MetaImage": metaimage, "NPY": npy, "MGH": mgh, "PNG": png}
 _MESHES = {".surf.gii": "GIFTI", ".ply": "PLY", ".obj": "OBJ", ".stl": "STL", ".glb": "GLB", ".vtk": "VTK"}
 
 
@@ -109,18 +111,8 @@ def read_volume(
     several complex ones, or `spacing` where the format has its own; DataError where the content cannot be read.
     """
     path = Path(path)
-    kind = _require_readable(path, spacing)
-    match kind:
-        case "NIfTI":
-            return nifti.read(path, dtype, channels=channels)
-        case "MetaImage":
-            return metaimage.read(path, dtype, channels=channels)
-        case "MGH":
-            return mgh.read(path, dtype, channels=channels)
-        case "PNG":
-            return png.read(path, dtype, channels=channels)
-        case _:
-            return npy.read(path, _steps(spacing), dtype, channels=channels, plane=plane)
+    module, options = _reader(path, spacing, channels, plane)
+    return module.read(path, dtype=dtype, **options)
 
 
 def open_series(
@@ -283,21 +275,22 @@ def _require_readable(path: Path, spacing: float | Sequence[float] | None) -> st
     return kind
 
 
+def _reader(
+    path: Path, spacing: float | Sequence[float] | None, channels: bool, plane: bool
+) -> tuple[Any, dict[str, Any]]:
+    """The module of a readable file's format, and what its `read` and `open_series` are to be told."""
+    kind = _require_readable(path, spacing)
+    options: dict[str, Any] = {"channels": channels}
+    if kind == "NPY":
+        options |= {"spacing": _steps(spacing), "plane": plane}
+    return _MODULES[kind], options
+
+
 def _look(path: Path, spacing: float | Sequence[float] | None, dtype: DTypeLike, channels: bool, plane: bool) -> Series:
     """What the header says, with values to be read on demand."""
     path = Path(path)
-    kind = _require_readable(path, spacing)
-    match kind:
-        case "NIfTI":
-            return nifti.open_series(path, dtype, channels=channels)
-        case "MetaImage":
-            return metaimage.open_series(path, dtype, channels=channels)
-        case "MGH":
-            return mgh.open_series(path, dtype, channels=channels)
-        case "PNG":
-            return png.open_series(path, dtype, channels=channels)
-        case _:
-            return npy.open_series(path, _steps(spacing), dtype, channels=channels, plane=plane)
+    module, options = _reader(path, spacing, channels, plane)
+    return module.open_series(path, dtype=dtype, **options)
 
 
 def _steps(spacing: float | Sequence[float] | None) -> float | tuple[float, ...]:
