@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from beltrami_cli.errors import DataError
 from beltrami_cli.grid import Grid
 from beltrami_cli.kernels import sheets
 from beltrami_cli.levelset import ZeroSurface, crossing_box, zero_surface
@@ -88,12 +89,49 @@ def build_band(psi: np.ndarray, grid: Grid, half_width: float) -> Band:
 
     Raises DataError where psi has no zero level.
     """
-    spacing = grid.spacing
-    margin = tuple(int(np.ceil(half_width / h)) + 1 if n > 1 else 0 for h, n in zip(spacing, grid.shape, strict=True))
-    box = crossing_box(psi, margin)
-    surface = zero_surface(psi[box], spacing)
-    shape = tuple(s.stop - s.start for s in box)
-    s = surface
+    box = crossing_box(psi, _margin(grid, half_width))
+    return _around(zero_surface(psi[box], grid.spacing), grid, box, half_width)
+
+
+def band_around(surface: ZeroSurface, grid: Grid, half_width: float) -> Band:
+    """The band of `half_width` mm around a mesh, its points in mm along the voxel axes from the grid's first voxel.
+
+    Banks stay apart however near they lie, for what is connected to what is the mesh's own word; where an open surface
+    ends, the band does. Raises DataError where the grid holds none of the surface.
+    """
+    ijk = surface.points / grid.spacing
+    inside = np.all((ijk >= 0) & (ijk <= np.array(grid.shape) - 1), axis=1)
+    if not inside.any():
+        low, high = (grid.to_world(end[None])[0] for end in (ijk.min(0), ijk.max(0)))
+        first, last = (grid.to_world(np.array([end], float))[0] for end in ((0, 0, 0), np.array(grid.shape) - 1))
+        raise DataError(
+            f"the surface lies outside of the volume: found vertices from {_place(low)} to {_place(high)}, voxels from "
+            f"{_place(first)} to {_place(last)} RAS mm; expected one space (--frame says which the surface is in)"
+        )
+    margin, held = _margin(grid, half_width), ijk[inside]
+    box = tuple(
+        slice(max(0, int(a) - m), min(n, int(np.ceil(b)) + 1 + m))
+        for a, b, m, n in zip(held.min(0), held.max(0), margin, grid.shape, strict=True)
+    )
+    low = np.array([part.start for part in box]) * grid.spacing
+    return _around(replace(surface, points=surface.points - low), grid, box, half_width)
+
+
+def _margin(grid: Grid, half_width: float) -> tuple[int, ...]:
+    """Voxels by which the band may reach beyond the surface's own, per axis."""
+    return tuple(
+        int(np.ceil(half_width / h)) + 1 if n > 1 else 0 for h, n in zip(grid.spacing, grid.shape, strict=True)
+    )
+
+
+def _place(ras_mm: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x:.4g}" for x in ras_mm) + ")"
+
+
+def _around(surface: ZeroSurface, grid: Grid, box: tuple[slice, ...], half_width: float) -> Band:
+    """The band in a box of the grid; the surface's points count from the box's first voxel."""
+    spacing, s = grid.spacing, surface
+    shape = tuple(part.stop - part.start for part in box)
     # Single precision tells near from far as well, and half the bytes come through the cache.
     points, normals = s.points.astype(np.float32), s.normals.astype(np.float32)
     grown = sheets.grow(shape, spacing, points, normals, s.start, s.ring, half_width)

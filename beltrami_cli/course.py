@@ -9,7 +9,7 @@ import numpy as np
 
 from beltrami_cli.band import Band
 from beltrami_cli.evolve import Evolution, Observer, Schedule, Stop, evolve
-from beltrami_cli.extension import Extended, Reextension, extend
+from beltrami_cli.extension import Extended, Reextension
 from beltrami_cli.flows import MOST_SUBSTEPS, Fidelity, Flow, Stepper
 from beltrami_cli.kinds import Kind
 
@@ -18,25 +18,18 @@ from beltrami_cli.kinds import Kind
 class Course:
     """What every flow on the same band and kind of value shares.
 
-    dt: mm^2. extend_every: steps between re-extensions, 0 for never. fidelity: L in 1/mm^2. extension, depth: see
-    `extension.extend`.
+    dt: mm^2. extend_every: steps between re-extensions, 0 for never. fidelity: L in 1/mm^2.
     """
 
     band: Band
     kind: Kind
     dt: float
-    extension: str = "closest-point"
-    depth: tuple[float, float] | None = None
     extend_every: int = 5
     fidelity: float = 0.0
 
     @cached_property
     def reextension(self) -> Reextension | None:
         return Reextension(self.band, turns=self.kind.turns) if self.extend_every else None
-
-    def start(self, own: np.ndarray, trust: np.ndarray) -> Extended:
-        """Start values from own samples (K, E) of weights `trust` (E,); raises as `extend`."""
-        return extend(self.band, own, trust, self.extension, depth=self.depth, turns=self.kind.turns)
 
     def run(
         self,

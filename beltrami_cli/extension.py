@@ -72,6 +72,36 @@ def extend(
         values, trust = at_closest_points(band, own, confidence, _depths(band, depth))
         if method == "none":
             values[:, band.primary], trust[band.primary] = own[:, band.primary], confidence[band.primary]
+    return _filled(band, values, trust, turns=turns)
+
+
+def from_vertices(
+    band: Band,
+    corners: np.ndarray,
+    weights: np.ndarray,
+    values: np.ndarray,
+    trust: np.ndarray,
+    *,
+    turns: bool = False,
+) -> Extended:
+    """Start values from data (K, V) of weights `trust` (V,), 0 where missing, at the vertices of the band's mesh.
+
+    Every entry takes the value at its closest point, linear over its triangle: vertices `corners` (E, 3) with weights
+    (E, 3); those without data take no part. Holes are then filled. Raises DataError and `turns` as `extend`.
+    """
+    share = np.where(trust[corners] > 0, weights, 0)
+    mass = (share * trust[corners]).sum(1)
+    mass[share.sum(1) < LEAST_WEIGHT] = 0
+    here = np.zeros((len(values), band.entries))
+    for k in range(3):
+        here += np.where(share[:, k] > 0, values[:, corners[:, k]], 0) * (share[:, k] * trust[corners[:, k]])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        start = np.where(mass > 0, here / mass, np.nan)
+    return _filled(band, start.astype(values.dtype), mass.astype(values.dtype), turns=turns)
+
+
+def _filled(band: Band, values: np.ndarray, trust: np.ndarray, *, turns: bool) -> Extended:
+    """The start from values (K, E) of confidence `trust` (E,), the unknown filled in place."""
     known = trust > 0
     if not known.any():
         raise DataError(

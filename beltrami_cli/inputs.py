@@ -91,13 +91,17 @@ def _signed(psi: np.ndarray, settings: Settings, warnings: Warnings) -> np.ndarr
 
 
 def trusted(
-    weights: np.ndarray | None, mask: np.ndarray | None, grid: Grid, settings: Settings, warnings: Warnings
+    weights: np.ndarray | None,
+    mask: np.ndarray | None,
+    shape: tuple[int, ...],
+    settings: Settings,
+    warnings: Warnings,
 ) -> np.ndarray:
-    """Weights over the grid, 0 to 1, 0 where the mask says that data do not count.
+    """Weights of this shape, 0 to 1, 0 where the mask says that data do not count.
 
     Raises RefusedError for weights below 0, DataError for weights that are 0 everywhere or a mask that is empty.
     """
-    trust = np.ones(grid.shape, settings.precision)
+    trust = np.ones(shape, settings.precision)
     if weights is not None:
         if np.isposinf(weights).any():
             raise RefusedError(

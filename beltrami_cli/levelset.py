@@ -1,4 +1,4 @@
-"""From any level-set volume to the mesh of its zero set, with normals and curvatures at the vertices."""
+"""The surface that a band grows around, from any level-set volume or from a mesh: with normals and curvatures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from beltrami_cli.errors import DataError
+from beltrami_cli.grid import Grid
 from beltrami_cli.kernels import mesh as kernels
+from beltrami_cli.surface import Mesh
 
 # Sizes given to marching cubes lie between FLOOR and 1 + FLOOR, and THIN_WEIGHT times that where the phase is thin: no
 # crossing then comes so near a node that single precision would lose the edge which it is on.
@@ -15,11 +17,15 @@ FLOOR = np.float32(0.1)
 THIN_WEIGHT = np.float32(12)
 # Least squares for curvature: rings smaller than this, in voxels, say little about it.
 RING_VOXELS = 0.1
+# A mesh whose edges (the 95th percentile) are longer than this, in voxels of the smallest spacing, is refined: a band
+# has its entries from the vertices that a voxel lies along the normal of, aside by no more than 1 voxel.
+LONGEST_EDGE = 1.5
+MOST_TRIANGLES = 20_000_000  # of a refined mesh: gigabytes of band, and no data that would need them
 
 
 @dataclass(frozen=True, eq=False)
 class ZeroSurface:
-    """The zero level of Psi as a mesh.
+    """The zero level of Psi as a mesh, or a mesh in its place.
 
     points: (V, 3) float64, mm along the voxel axes (index times spacing).
     cells: (C, 3) int32 triangles, or (C, 2) segments where the grid is a plane; counter-clockwise in index space seen
@@ -89,7 +95,82 @@ def zero_surface(psi: np.ndarray, spacing: np.ndarray) -> ZeroSurface:
     mesh_normals = kernels.ring_mean(raw, start, ring)
     ijk, normals = kernels.refine_crossings(psi, ijk, spacing, mesh_normals)
     points = ijk * spacing
-    voxel = spacing[: 3 if psi.shape[2] > 1 else 2].min()
+    return _curved(points, cells, normals, start, ring, spacing[: 3 if psi.shape[2] > 1 else 2].min())
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A mesh made fine enough for a grid, every triangle split in four at the middle of its edges, some times over.
+
+    surface: its first vertices are those of the mesh it was made from. edges: for every time, the (M, 2) vertices
+    between which the new ones lie.
+    """
+
+    surface: ZeroSurface
+    edges: tuple[np.ndarray, ...]
+
+    def carry(self, values: np.ndarray, trust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values (K, V) of weights `trust` (V,), 0 where missing, at all vertices: new ones have the ends' mean."""
+        for ends in self.edges:
+            weight = trust[ends]
+            mass = weight.sum(1)
+            with np.errstate(invalid="ignore"):
+                middle = (np.where(weight > 0, values[:, ends], 0) * weight).sum(-1) / mass
+            values = np.concatenate([values, middle.astype(values.dtype)], 1)
+            trust = np.concatenate([trust, (mass / 2).astype(trust.dtype)])
+        return values, trust
+
+
+def refined(mesh: Mesh, grid: Grid) -> Refined:
+    """The mesh for a band on this grid: points in mm along the voxel axes from the grid's first voxel.
+
+    Raises DataError where the mesh has no triangle of any area, or edges so long for the voxels that it cannot be
+    refined.
+    """
+    spacing = grid.spacing
+    points = grid.to_index(mesh.vertices_ras_mm) * spacing
+    cells = np.ascontiguousarray(facing(mesh.cells, grid), np.int32)
+    splits: list[np.ndarray] = []
+    while True:
+        ends = np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+        length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
+        if not len(cells) or not length.max() > 0:
+            raise DataError("the surface has no triangle of any area: is it a mesh at all?")
+        if np.percentile(length, 95) <= LONGEST_EDGE * spacing.min():
+            break
+        if 4 * len(cells) > MOST_TRIANGLES:
+            raise DataError(
+                f"the surface's edges are {np.percentile(length, 95):.4g} mm long on voxels of {spacing.min():.4g} mm, "
+                f"after {len(splits)} refinements to {len(cells)} triangles; expected a finer mesh or coarser voxels "
+                "(are both in mm?)"
+            )
+        points, cells, edges = _split(points, cells, ends)
+        splits.append(edges)
+    start, ring = kernels.half_edges(cells, len(points))
+    normals = kernels.ring_mean(kernels.face_normals(points, cells), start, ring)
+    return Refined(_curved(points, cells, normals, start, ring, spacing.min()), tuple(splits))
+
+
+def _split(points: np.ndarray, cells: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, cells and the edges split; ends: (3 C, 2) of the edges 01, 12, 20 of every triangle, sorted."""
+    edges, number = np.unique(ends, axis=0, return_inverse=True)
+    ab, bc, ca = (len(points) + number.reshape(-1, 3)).T
+    a, b, c = cells.T
+    finer = np.concatenate([np.stack(corners, 1) for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    return np.concatenate([points, points[edges].mean(1)]), np.ascontiguousarray(finer, np.int32), edges
+
+
+def facing(cells: np.ndarray, grid: Grid) -> np.ndarray:
+    """Cells whose corners run the other way round where the grid's index axes are left-handed.
+
+    Counter-clockwise in the world is clockwise there, and the reverse.
+    """
+    return cells if grid.handedness > 0 else np.ascontiguousarray(cells[:, ::-1])
+
+
+def _curved(
+    points: np.ndarray, cells: np.ndarray, normals: np.ndarray, start: np.ndarray, ring: np.ndarray, voxel: float
+) -> ZeroSurface:
     curvature, direction = kernels.principal_curvatures(
         points, normals, start, ring, 1 / voxel, (RING_VOXELS * voxel) ** 2
     )

@@ -1,7 +1,8 @@
-"""Noise on a surface, from differences between linked voxels: how strong, how smooth, whether it is correlated.
+"""Noise on a surface, from differences between neighbours: how strong, how smooth, whether it is correlated.
 
-A slope along the surface cancels in the differences, and the scale is robust, so that borders and outliers do not count
-as noise. Nothing here is random.
+Neighbours are linked voxels of a band, or vertices of a mesh (the functions `..._on_mesh`). A slope along the surface
+cancels in the differences, and the scale is robust, so that borders and outliers do not count as noise. Nothing here is
+random.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from beltrami_cli.band import Band
+from beltrami_cli.kernels import mesh as meshes
 from beltrami_cli.kinds import Kind
 
 # Entries looked at: enough for a standard deviation to 1 %, in some tenths of a second.
@@ -49,7 +51,28 @@ def noise_sd(band: Band, samples: np.ndarray, kind: Kind) -> np.ndarray:
         up, side = _walk(band, entries, a, 1), _walk(band, entries, b, 1)
         across = _walk(band, up, b, 1)
         faces.append((_at(values, entries) - _at(values, up)) - (_at(values, side) - _at(values, across)))
-    w = np.concatenate(faces, axis=1)
+    return _sd_of_crosses(np.concatenate(faces, axis=1), kind)
+
+
+def noise_sd_on_mesh(cells: np.ndarray, samples: np.ndarray, kind: Kind) -> np.ndarray:
+    """As `noise_sd`, of samples (K, V) at the vertices of triangles (C, 3).
+
+    From w = x_a + x_b - x_c - x_d, where ab is the edge that the triangles abc and bad share.
+    """
+    edge = np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    opposite = cells[:, [2, 0, 1]].reshape(-1)
+    order = np.lexsort(edge.T)
+    edge, opposite = edge[order], opposite[order]
+    pair = np.flatnonzero((edge[1:] == edge[:-1]).all(1))
+    pair = pair[:: 1 + len(pair) // ENTRIES]
+    a, b, c, d = edge[pair, 0], edge[pair, 1], opposite[pair], opposite[pair + 1]
+    values = np.arctan2(samples[1:2], samples[0:1]) if kind.is_circular else samples
+    x = values.astype(float)
+    return _sd_of_crosses((x[:, a] - x[:, c]) + (x[:, b] - x[:, d]), kind)
+
+
+def _sd_of_crosses(w: np.ndarray, kind: Kind) -> np.ndarray:
+    """Half the robust standard deviation of w (K, N), each of two samples less two others, in data units."""
     if kind.is_circular:
         w = (w + np.pi) % (2 * np.pi) - np.pi
     return np.array([kind.unit * _robust_sd(channel, wraps=kind.is_circular) / 2 for channel in w])
@@ -72,7 +95,18 @@ def smoothness_mm(band: Band, values: np.ndarray, kind: Kind) -> float:
         near.append(_at(values, start))
         far.append(_at(values, _walk(band, start, axis, 1)))
         squares.append(band.grid.spacing[axis] ** 2 * (1 - obliquity[tangential].astype(float) ** 2))
-    a, b, d2 = np.concatenate(near, axis=1), np.concatenate(far, axis=1), np.concatenate(squares)
+    return _fwhm(np.concatenate(near, axis=1), np.concatenate(far, axis=1), np.concatenate(squares), kind)
+
+
+def smoothness_on_mesh(points: np.ndarray, cells: np.ndarray, values: np.ndarray, kind: Kind) -> float:
+    """As `smoothness_mm`, of values (K, V) at vertices (V, 3), mm, of triangles (C, 3): over the edges."""
+    a, b = np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0).T
+    x = values.astype(float)
+    return _fwhm(x[:, a], x[:, b], ((points[a] - points[b]) ** 2).sum(1), kind)
+
+
+def _fwhm(a: np.ndarray, b: np.ndarray, d2: np.ndarray, kind: Kind) -> float:
+    """The width of Forman et al. from values (K, N) at both ends of links whose squared lengths are d2 (N,), mm^2."""
     linked = ~(np.isnan(a) | np.isnan(b)).any(0)
     a, b, d2 = a[:, linked], b[:, linked], d2[linked]
     if kind.is_circular:
@@ -100,6 +134,24 @@ def looks_correlated(band: Band, samples: np.ndarray, kind: Kind) -> bool:
     """
     one, two, three = (_second_differences(band, samples, kind, m, 0, TANGENTIAL) ** 2 for m in (1, 2, 3))
     along_normal = _second_differences(band, samples, kind, 1, NORMAL, 1) ** 2
+    return _is_correlated(one, two, three, along_normal)
+
+
+def looks_correlated_on_mesh(
+    points: np.ndarray, start: np.ndarray, ring: np.ndarray, samples: np.ndarray, kind: Kind
+) -> bool:
+    """As `looks_correlated`, of samples (K, V) at the vertices (V, 3) of a mesh with neighbours start, ring."""
+    walks = meshes.straight_walks(points, start, ring, 3)
+    here = np.flatnonzero(~np.isnan(samples[0]))
+    here = here[:: 1 + len(here) // ENTRIES]
+    forth, back = walks[here, 0], walks[here, 1]
+    scale = _at(samples, here).std(axis=1) if len(here) else np.zeros(len(samples))
+    one, two, three = (_spread_of_bends(samples, here, forth[:, m], back[:, m], scale, kind) ** 2 for m in range(3))
+    return _is_correlated(one, two, three, np.nan)
+
+
+def _is_correlated(one: float, two: float, three: float, along_normal: float) -> bool:
+    """Whether the variances of second differences over 1, 2 and 3 links, and along the normal, say so."""
     of_map = max(three - two, 0.0) / (3**4 - 2**4)
     noise = two - 2**4 * of_map
     nearest = np.fmin(one - of_map, along_normal)
@@ -115,19 +167,30 @@ def _second_differences(band: Band, samples: np.ndarray, kind: Kind, voxels: int
     entries = _near(band, samples)
     if entries.size < LEAST_DIFFERENCES:
         return np.nan
-    found = []
+    middles, forth, back = [], [], []
     for axis in _axes(band):
         obliquity = np.abs(band.normal[axis, entries])
         middle = entries[(obliquity >= least) & (obliquity <= most)]
-        here = _at(samples, middle)
-        sides = _at(samples, _walk(band, middle, axis, voxels)) + _at(samples, _walk(band, middle, axis, -voxels))
-        if kind.is_circular:
-            found.append((here[0] * sides[1] - here[1] * sides[0])[None])
-        else:
-            found.append(sides - 2 * here)
-    w = np.concatenate(found, axis=1)
-    if not kind.is_circular:
-        scale = _at(samples, entries).std(axis=1)
+        middles.append(middle)
+        forth.append(_walk(band, middle, axis, voxels))
+        back.append(_walk(band, middle, axis, -voxels))
+    scale = _at(samples, entries).std(axis=1)
+    middle, there, behind = (np.concatenate(part) for part in (middles, forth, back))
+    return _spread_of_bends(samples, middle, there, behind, scale, kind)
+
+
+def _spread_of_bends(
+    samples: np.ndarray, middle: np.ndarray, forth: np.ndarray, back: np.ndarray, scale: np.ndarray, kind: Kind
+) -> float:
+    """Robust sd of x_forth + x_back - 2 x_middle, places (N,) in samples (K, M), -1 for none, each channel over scale.
+
+    For angles the component across the middle one.
+    """
+    here, sides = _at(samples, middle), _at(samples, forth) + _at(samples, back)
+    if kind.is_circular:
+        w = (here[0] * sides[1] - here[1] * sides[0])[None]
+    else:
+        w = sides - 2 * here
         w = w[scale > 0] / scale[scale > 0, None]
     size = np.abs(w[~np.isnan(w)])
     return float(np.median(size)) / MEDIAN if size.size >= LEAST_DIFFERENCES else np.nan

@@ -13,33 +13,32 @@ from beltrami_cli.evolve import Schedule
 from beltrami_cli.extension import Extended
 from beltrami_cli.flows import Flow, typical_slope
 from beltrami_cli.inputs import Warnings
-from beltrami_cli.noise import looks_correlated, noise_sd
+from beltrami_cli.observed import Observed
 from beltrami_cli.progress import Phases
-from beltrami_cli.tuning import LEAST_HELD, Choice, Family, can_hold_out, choose, decorrelated
+from beltrami_cli.tuning import LEAST_HELD, Choice, Family, choose, decorrelated
 
 # eps of the flows l1 and tv as a share of the data's typical slope: so small that nearly every slope counts as an edge.
 EPS_SHARE = 0.1
-CORRELATED = "the noise of neighbouring voxels looks correlated (interpolated, or painted from a mesh)"
+CORRELATED = "the noise of neighbours looks correlated (interpolated, or painted from a mesh)"
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Data on the band. own: (K, E) samples of weights trust (E,); start: the values that the flow starts from."""
+    """Data, and the values on the band that the flow starts from."""
 
     course: Course
-    own: np.ndarray
-    trust: np.ndarray
+    observed: Observed
     start: Extended
 
     @cached_property
     def noise(self) -> np.ndarray:
         """Standard deviations, (K,) or (1,), as `noise.noise_sd` finds them."""
-        return noise_sd(self.course.band, self.own, self.course.kind)
+        return self.observed.noise_sd()
 
     @cached_property
     def looks_correlated(self) -> bool:
-        """True where the noise of neighbouring voxels is alike, see `noise.looks_correlated`."""
-        return looks_correlated(self.course.band, self.own, self.course.kind)
+        """True where the noise of neighbours is alike, see `noise.looks_correlated`."""
+        return self.observed.looks_correlated()
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +84,14 @@ class Planner:
         elif self._chooses(fixed, sample):
             with self.phases("choose"):
                 choice = choose(
-                    course, sample.own, sample.trust, self._families(fixed, slope), slope, steps, settings.seed,
+                    course, sample.observed, self._families(fixed, slope), slope, steps, settings.seed,
                     stop=settings.stop == "auto",
                 )  # fmt: skip
             flow, beta, steps = choice.flow, choice.beta, choice.iterations
             self._doubt(choice, sample)
         if settings.stop == "decorrelation" and steps:
             with self.phases("choose"):
-                steps = decorrelated(course, sample.own, sample.trust, start, flow, beta, self.iterations)
+                steps = decorrelated(course, sample.observed, start, flow, beta, self.iterations)
             if steps == self.iterations:
                 self.warnings.add(f"stop decorrelation: the correlation was still falling after {steps} iterations")
         return Plan(flow, Schedule(np.full(steps, beta), course.dt, self.ends_by), slope, sample.noise, choice)
@@ -120,8 +119,8 @@ class Planner:
         if self.settings.flow == "auto":
             return True
         why = None
-        if can_hold_out(sample.course, sample.trust)[1] < LEAST_HELD:
-            why = "there are too few valid voxels beside the surface to hold some out"
+        if sample.observed.can_hold_out()[1] < LEAST_HELD:
+            why = f"there are too few valid {sample.observed.places} beside the surface to hold some out"
         elif sample.looks_correlated:
             why = f"{CORRELATED}, so that held-out ones would be predicted from their own copies"
         if why:
@@ -150,8 +149,8 @@ class Planner:
             )
         elif self.settings.stop == "auto" and not choice.is_clear and not self.settings.flat:
             self.warnings.add(
-                "automatic choice: no run predicts the held-out voxels clearly better than the data as they are; "
-                + way_out
+                f"automatic choice: no run predicts the held-out {sample.observed.places} clearly better than the data "
+                f"as they are; {way_out}"
             )
         if choice.at_end:
             self.warnings.add(f"the held-out error was still falling after {choice.iterations} iterations; {way_out}")

@@ -20,20 +20,20 @@ from beltrami_cli.evolve import Evolution
 from beltrami_cli.extension import Extended
 from beltrami_cli.grid import Grid
 from beltrami_cli.kinds import Kind
+from beltrami_cli.observed import Observed
 from beltrami_cli.planning import Plan
-from beltrami_cli.tuning import Choice, near_surface
+from beltrami_cli.tuning import Choice
 
 
 @dataclass(frozen=True, eq=False)
 class Ran:
-    """One run on one set of data. own: (K, E) samples of weights trust (E,); values: (K, E) as they came out.
+    """One run on one set of data. values: (K, E) as they came out.
 
     excess: by how much values had left the range of the data (data units). smoothness: FWHM before and after, mm.
     """
 
     kind: Kind
-    own: np.ndarray
-    trust: np.ndarray
+    observed: Observed
     start: Extended
     evolution: Evolution
     substeps: int
@@ -46,8 +46,9 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
     """What was used and what happened, JSON-ready; lengths mm, dt mm^2, beta mm per data unit."""
     primary, schedule, evolution = band.primary, plan.schedule, ran.evolution
     missing = np.isnan(ran.values[0, primary])
-    near = near_surface(band, ran.trust)
-    near = near[~np.isnan(ran.values[0, near])]
+    near = ran.observed.near()
+    given, left = ran.observed.values[:, near], ran.observed.seen(near)(ran.values)
+    there = ~np.isnan(left[0])
     beta = schedule.beta[: evolution.iterations]
     return {
         "Parameters": _used(settings, band, plan, evolution),
@@ -70,7 +71,7 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
         "TypicalSlope": plan.slope,
         "Noise": {
             "sd": [_number(sd) for sd in plan.noise],
-            "meaning": "robust standard deviation of the noise of a voxel on the surface, data units, per channel",
+            "meaning": f"robust standard deviation over {ran.observed.places} on the surface, data units, per channel",
         },
         "Smoothness": {
             "before_mm": _number(ran.smoothness[0]),
@@ -78,12 +79,12 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
             "meaning": "FWHM along the surface of what the values show, map and noise (Forman et al. 1995)",
         },
         "Removed": {
-            "rms": _number(ran.kind.spread(ran.own[:, near], ran.values[:, near])),
-            "voxels": len(near),
-            "meaning": "input minus output at valid voxels within half a voxel of the surface",
+            "rms": _number(ran.kind.spread(given[:, there], left[:, there])),
+            ran.observed.places: int(there.sum()),
+            "meaning": f"input minus output at valid {ran.observed.places} within half a voxel of the surface",
         },
         "ClippedExcess": ran.excess,
-        "Choice": None if plan.choice is None else _chosen(plan.choice),
+        "Choice": None if plan.choice is None else _chosen(plan.choice, ran.observed.places),
         "PerIteration": {
             "beta": beta.tolist(),
             "dt": [schedule.dt] * len(beta),
@@ -125,15 +126,15 @@ def _used(settings: Settings, band: Band, plan: Plan, evolution: Evolution) -> d
     }
 
 
-def _chosen(choice: Choice) -> dict[str, Any]:
+def _chosen(choice: Choice, places: str) -> dict[str, Any]:
     return {
         "flow": choice.flow.name,
         "phi": choice.flow.phi if choice.flow.name == "phi" else None,
         "beta": choice.beta if choice.flow.has_beta else None,
         "iterations": choice.iterations,
-        "held_out_voxels": choice.held_out,
+        f"held_out_{places}": choice.held_out,
         "gain_standard_errors": choice.gain,
-        "meaning": "error: root mean square at the held-out voxels, data units; each row at its best iteration",
+        "meaning": f"error: root mean square at the held-out {places}, data units; each row at its best iteration",
         "table": choice.table(),
     }
 

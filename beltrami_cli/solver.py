@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from beltrami_cli.config import Settings
 from beltrami_cli.course import Course
 from beltrami_cli.errors import DataError, NumericsError
 from beltrami_cli.evolve import Observer
-from beltrami_cli.extension import Extended, own_samples
+from beltrami_cli.extension import Extended
 from beltrami_cli.geodesic import distance_along
 from beltrami_cli.grid import Grid
 from beltrami_cli.inputs import (
@@ -29,11 +29,12 @@ from beltrami_cli.inputs import (
     without,
 )
 from beltrami_cli.kinds import Kind, kind_of
-from beltrami_cli.noise import smoothness_mm
+from beltrami_cli.observed import VertexBand
+from beltrami_cli.places import Vertices, Voxels
 from beltrami_cli.planning import CORRELATED, Plan, Planner, Sample
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import Ran, over_frames, what_happened
-from beltrami_cli.sampling import surface_mesh
+from beltrami_cli.sampling import SurfacePoints, own_vertices, surface_mesh, vertices_of
 from beltrami_cli.surface import Mesh
 from beltrami_cli.tuning import discrepancy
 
@@ -46,10 +47,12 @@ class Result:
     """What a run gives.
 
     data: denoised values in the shape and kind of the input, NaN (or what `outside` says) beyond the band.
-    mesh: the surface in RAS mm with the denoised value at every vertex, (V,) or (V, K); None for a flat run.
+    mesh: the surface in RAS mm with the denoised value at every vertex, (V,) or (V, K); None for a flat run. Where the
+        surface was given as a mesh, its own vertices and triangles, in their order.
     filled: bool, in the shape of one channel: where a value was filled in.
     record: every parameter as used and what happened, as in the sidecar.
     warnings: lines for the user.
+    on: values, (V,) or (V, K), at the vertices of other meshes of the surface, NaN where they lie beside the band.
     """
 
     data: np.ndarray
@@ -57,39 +60,79 @@ class Result:
     filled: np.ndarray
     record: dict[str, Any]
     warnings: tuple[str, ...]
+    on: tuple[np.ndarray, ...] = ()
 
 
 class Solver:
     """The band, the weights and the settings that all frames of a run share.
 
-    psi: (nx, ny, nz), None for a flat run. weights: of the same shape, 0 or more, or None; mask: likewise, which data
-    count (not 0). Raises as `denoise`.
+    surface: Psi, (nx, ny, nz), or a mesh in RAS mm; None for a flat run. at_vertices: the data lie at the vertices of
+    the mesh, not in the voxels of the grid. weights: of the shape of one channel of the data, 0 or more, or None;
+    mask: likewise, which data count (not 0). on: other meshes of the surface whose vertices are to get values.
+    Raises as `denoise`.
     """
 
     def __init__(
         self,
-        psi: np.ndarray | None,
+        surface: np.ndarray | Mesh | None,
         grid: Grid,
         settings: Settings,
         phases: Phases,
         warnings: Warnings,
         weights: np.ndarray | None = None,
         mask: np.ndarray | None = None,
+        *,
+        at_vertices: bool = False,
+        on: Sequence[Mesh] = (),
     ) -> None:
         require_usable(grid, "the grid")
         self.grid, self.settings, self.phases, self.warnings = grid, settings, phases, warnings
         numba.set_num_threads(min(settings.threads or _cpus(), numba.config.NUMBA_NUM_THREADS))
         iterations, dt, ends_by = settings.duration(time_step(grid, settings))
         self.planner = Planner(settings, iterations, ends_by, phases, warnings)
-        self.plane = PlaneLast(grid)
-        trust = trusted(weights, mask, grid, settings, warnings)
+        self.places: Voxels | Vertices
+        shape: tuple[int, ...] = grid.shape
         with phases("band"):
-            self.band = band_of(psi, settings, self.plane, warnings)
-            self.trust = self.band.gather(self.plane.forth(trust))
-            self.course = Course(
-                self.band, Kind(), dt, settings.extension, settings.depth, settings.reextends_every,
-                settings.fidelity or 0.0,
-            )  # fmt: skip
+            self.shown: list[tuple[Mesh, SurfacePoints]] = []
+            if isinstance(surface, Mesh):
+                of_mesh = VertexBand(surface, grid, settings.half_width(grid.used_spacing))
+                self.band, plane = of_mesh.band, PlaneLast(grid)
+                self.shown.append((surface, of_mesh.vertices))
+                self._tell_lost(of_mesh)
+            else:
+                plane = PlaneLast(grid)
+                self.band = band_of(surface, settings, plane, warnings)
+                if surface is not None:
+                    self.shown.append((surface_mesh(self.band)[0], own_vertices(self.band)))
+            if at_vertices:
+                assert isinstance(surface, Mesh)
+                self.places, shape = Vertices(of_mesh), (len(surface.vertices_ras_mm),)
+            else:
+                self.places = Voxels(self.band, plane, settings.extension, settings.depth, settings.outside)
+            self.trust = self.places.take(trusted(weights, mask, shape, settings, warnings))
+            self.shown += [(mesh, self._found(mesh)) for mesh in on]
+            self.course = Course(self.band, Kind(), dt, settings.reextends_every, settings.fidelity or 0.0)
+
+    def _tell_lost(self, of_mesh: VertexBand) -> None:
+        lost = int((~of_mesh.reached).sum())
+        if lost:
+            self.warnings.add(
+                f"{lost} of {len(of_mesh.reached)} vertices belong to no triangle, or lie outside of the grid: "
+                "they get no value"
+            )
+
+    def _found(self, mesh: Mesh) -> SurfacePoints:
+        """Where the vertices of another mesh are on the band; raises DataError where none is."""
+        points = vertices_of(self.band, mesh)
+        lost = int((points.start < 0).sum())
+        if lost == len(points.start):
+            raise DataError(
+                f"on: none of the {lost} vertices lies within {self.band.half_width:g} mm of the surface; expected a "
+                "mesh of the same surface in the same space (--frame says which it is in)"
+            )
+        if lost:
+            self.warnings.add(f"on: {lost} of {len(points.start)} vertices lie beyond the band: they get no value")
+        return points
 
     def denoise(self, data: np.ndarray, observer: Observer | None = None) -> Result:
         """Denoise data of shape grid.shape, or grid.shape + (K,) for a vector."""
@@ -146,7 +189,7 @@ class Solver:
             except DataError as error:
                 reason = error
                 continue
-            if np.nanmin(sample.own) < np.nanmax(sample.own):
+            if np.nanmin(sample.observed.values) < np.nanmax(sample.observed.values):
                 return t, sample
             constant = constant or (t, sample)
         if constant is None:
@@ -157,24 +200,22 @@ class Solver:
     def _sample(self, data: np.ndarray, warnings: Warnings) -> Sample:
         """The data as channels on the band; raises DataError where none are valid."""
         with self.phases("extend"):
-            here = without(self.band.gather(self.plane.forth(data)), self.settings.missing)
+            here = without(self.places.take(data), self.settings.missing)
             here[self.trust == 0] = np.nan
             here = finite_or_missing(here, warnings)
             name = "scalar" if self.settings.independent else self.settings.kind
             kind, doubt = kind_of(name, here, self.settings.period)
             if doubt:
                 warnings.add(doubt)
-            own = own_samples(self.band, kind.to_channels(here), every=self.settings.extension == "none")
-            trust = np.where(np.isnan(own[0]), 0, self.trust).astype(own.dtype)
-            own[:, trust == 0] = np.nan
             if kind != self.course.kind:  # else its re-extension is already prepared
                 self.course = replace(self.course, kind=kind)
-            start = self.course.start(own, trust)
+            observed = self.places.observe(here, kind, self.trust)
+            start = observed.start()
         missing = np.isnan(start.values[0, self.band.primary]).mean()
         if missing > LONE_SHARE:
             share = f"{100 * missing:.1f} %"
             warnings.add(f"{share} of the band lies on parts of the surface without any data: left missing")
-        return Sample(self.course, own, trust, start)
+        return Sample(self.course, observed, start)
 
     def _run(
         self, data: np.ndarray, sample: Sample, plan: Plan, warnings: Warnings, observer: Observer | None
@@ -187,7 +228,7 @@ class Solver:
                 raise DataError("stop discrepancy: the noise cannot be estimated from these data; give --noise-sigma S")
             if settings.noise_sigma is None and sample.looks_correlated:
                 warnings.add(f"stop discrepancy: {CORRELATED}, which hides its size; give it as --noise-sigma S")
-            stop = discrepancy(course, sample.own, sample.trust, sigma)
+            stop = discrepancy(sample.observed, sigma)
         with self.phases("flow"):
             evolution, substeps = course.run(start, plan.flow, plan.schedule, observer, stop)
             values, excess = _within_range(evolution.values, start, course.kind)
@@ -202,35 +243,27 @@ class Solver:
                 "is --noise-sigma in the unit of DATA?"
             )
         with self.phases("mesh"):
-            mesh = None
-            if not settings.flat:
-                mesh, at_vertices = surface_mesh(band, values, turns=course.kind.turns)
-                assert at_vertices is not None
-                mesh = replace(mesh, values=course.kind.at_vertices(at_vertices))
-        out = self._volume(course.kind.to_values(values), data)
-        filled = ~start.known & ~np.isnan(values[0])
-        smoothness = smoothness_mm(band, sample.own, course.kind), smoothness_mm(band, values, course.kind)
-        ran = Ran(course.kind, sample.own, sample.trust, start, evolution, substeps, values, excess, smoothness)
-        return Result(
-            out, mesh, self.plane.back(band.scatter(filled, 0.0)),
-            what_happened(settings, self.grid, band, plan, ran), tuple(self.warnings.lines),
-        )  # fmt: skip
+            shown = [course.kind.at_vertices(points(values, turns=course.kind.turns)) for _, points in self.shown]
+        smoothness = sample.observed.smoothness_mm(), sample.observed.smoothness_mm(values)
+        ran = Ran(course.kind, sample.observed, start, evolution, substeps, values, excess, smoothness)
+        out, filled = (
+            self.places.give(values, course.kind, data),
+            self.places.filled(values, start.known, sample.observed),
+        )
+        return self._result(out, shown, filled, what_happened(settings, self.grid, band, plan, ran))
 
-    def _volume(self, values: np.ndarray, data: np.ndarray) -> np.ndarray:
-        """The band's values (E, ...) as a volume in the shape of the data."""
-        nan = complex(np.nan, np.nan) if np.iscomplexobj(values) else np.nan
-        outside: dict[str, np.ndarray | complex] = {"nan": nan, "zero": 0.0, "keep": self.plane.forth(data)}
-        return self.plane.back(self.band.scatter(values, outside[self.settings.outside]))
+    def _result(self, data: np.ndarray, shown: list[np.ndarray], filled: np.ndarray, record: dict[str, Any]) -> Result:
+        mesh, on = None, shown
+        if not self.settings.flat:
+            mesh, on = replace(self.shown[0][0], values=shown[0]), shown[1:]
+        return Result(data, mesh, filled, record, tuple(self.warnings.lines), tuple(on))
 
     def _nothing(self, data: np.ndarray) -> Result:
         """The result for a frame without data: everything missing."""
-        band = self.band
-        out = self._volume(np.full(band.entries, np.nan, data.dtype), data)
-        mesh = None
-        if not self.settings.flat:
-            mesh = surface_mesh(band)[0]
-            mesh = replace(mesh, values=np.full(len(mesh.vertices_ras_mm), np.nan, data.dtype))
-        return Result(out, mesh, np.zeros(self.grid.shape, bool), {}, ())
+        values = np.full((1, self.band.entries), np.nan, data.dtype)
+        out = self.places.give(values, Kind(), data)
+        shown = [np.full(len(mesh.vertices_ras_mm), np.nan, data.dtype) for mesh, _ in self.shown]
+        return self._result(out, shown, np.zeros(data.shape, bool), {})
 
 
 def _within_range(values: np.ndarray, start: Extended, kind: Kind) -> tuple[np.ndarray, float]:

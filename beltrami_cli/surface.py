@@ -14,11 +14,13 @@ class Mesh:
     vertices_ras_mm: (V, 3) float64 in RAS mm.
     cells: (C, 3) int32 triangles, counter-clockwise seen from outside; (C, 2) segments for a curve.
     values: (V,) data values, or (V, K) of K channels or frames, real, NaN where missing; None for geometry alone.
+    structure: the part of the brain in GIFTI's names, as CortexLeft; None where unknown.
     """
 
     vertices_ras_mm: np.ndarray
     cells: np.ndarray
     values: np.ndarray | None = None
+    structure: str | None = None
 
     def named_values(self) -> dict[str, np.ndarray]:
         """(V,) values by name: `value`, or `value 1`, `value 2` ... of several channels; empty for geometry alone."""

@@ -1,8 +1,8 @@
 """Automatic choice of the flow, its beta and when to stop, by data that the flow has not seen; stopping rules.
 
-Some valid voxels near the surface are held out, the data are extended without them, and the flow runs over a path of
-beta. After every iteration its values at the held-out voxels are compared with their data: with noise that is
-independent from voxel to voxel, the mean squared error there is the noise's variance plus the squared error against
+Some of the data near the surface are held out, the rest is extended, and the flow runs over a path of beta. After every
+iteration its values at the held-out places are compared with their data: with noise that is independent from place to
+place, the mean squared error there is the noise's variance plus the squared error against
 what lies below the noise, so both have their least value together. Iterations are then repeated on all data.
 """
 
@@ -13,21 +13,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beltrami_cli.band import Band
 from beltrami_cli.course import Course
 from beltrami_cli.errors import DataError, NumericsError
 from beltrami_cli.evolve import Schedule, Stop
 from beltrami_cli.extension import Extended
 from beltrami_cli.flows import Flow
 from beltrami_cli.kinds import Kind
+from beltrami_cli.observed import Observed
 
-# Half of the valid voxels 1 to 2 voxels from the surface are held out. Nearer ones make the start values, which would
-# miss them: where one is held out the flow has a gap to fill, and longer runs win that are too long for all data. Where
-# the shell's own voxels enter the start (averages over depth), or data end before it, a smaller share has to do.
-SHELL = (1.0, 2.0)
-SHELL_SHARE, NEAR_SHARE = 0.5, 0.15
-FLAT_SHARE = 0.05  # without a surface every voxel is its own start value: few and far between
-LEAST_HELD = 30  # voxels, below which an error says nothing
+LEAST_HELD = 30  # places, below which an error says nothing
 # A curve of error over iterations has passed its least value when it has gone on for a third as long again, and 6 more:
 # longer than from one re-extension to the next.
 PATIENCE = (1.33, 6)
@@ -93,27 +87,13 @@ class Choice:
         ]
 
 
-def can_hold_out(course: Course, trust: np.ndarray) -> tuple[np.ndarray, int]:
-    """Entries (N,) of voxels near the surface and how many of them to hold out; trust: (E,), 0 where missing."""
-    band = course.band
-    if band.surface is None:
-        valid = np.flatnonzero(trust > 0)
-        return valid, round(FLAT_SHARE * len(valid))
-    voxels = np.abs(band.distance) / band.grid.used_spacing.max()
-    inner = np.flatnonzero((trust > 0) & (voxels < SHELL[0]))
-    shell = np.flatnonzero((trust > 0) & (voxels >= SHELL[0]) & (voxels < SHELL[1]))
-    valid = shell if len(shell) > len(inner) / 2 else inner
-    share = SHELL_SHARE if valid is shell and course.depth is None else NEAR_SHARE
-    return valid, round(share * len(valid))
-
-
-def hold_out(course: Course, trust: np.ndarray, seed: int) -> np.ndarray:
-    """Entries (H,) whose data are held out; raises DataError where too few voxels hold data."""
-    valid, count = can_hold_out(course, trust)
+def hold_out(observed: Observed, seed: int) -> np.ndarray:
+    """Places (H,) whose data are held out; raises DataError where too few hold data."""
+    valid, count = observed.can_hold_out()
     if count < LEAST_HELD:
         raise DataError(
-            f"automatic choice: found {len(valid)} valid voxels beside the surface, of which to hold out {count}; "
-            f"expected at least {LEAST_HELD}; give --beta and --iterations"
+            f"automatic choice: found {len(valid)} valid {observed.places} beside the surface, of which to hold out "
+            f"{count}; expected at least {LEAST_HELD}; give --beta and --iterations"
         )
     return np.sort(np.random.default_rng(seed).choice(valid, count, replace=False))
 
@@ -128,8 +108,7 @@ class Family:
 
 def choose(
     course: Course,
-    own: np.ndarray,
-    trust: np.ndarray,
+    observed: Observed,
     families: list[Family],
     slope: float,
     iterations: int,
@@ -139,20 +118,17 @@ def choose(
 ) -> Choice:
     """The run of least held-out error over `families`, their betas and, with `stop`, iterations up to `iterations`.
 
-    own: (K, E) samples of weights trust (E,). slope: typical slope of the data (data units per mm), where the search
-    over beta starts. Without `stop`, runs are compared at their last iteration.
-    Raises DataError where too few voxels hold data, NumericsError where no run stays within the finite numbers.
+    slope: typical slope of the data (data units per mm), where the search over beta starts. Without `stop`, runs are
+    compared at their last iteration.
+    Raises DataError where too few places hold data, NumericsError where no run stays within the finite numbers.
     """
-    held = hold_out(course, trust, seed)
-    rest, left = own.copy(), trust.copy()
-    rest[:, held], left[held] = np.nan, 0
-    start = course.start(rest, left)
-    weight = trust[held] / trust[held].sum(dtype=float)
-    truth = own[:, held]
+    held = hold_out(observed, seed)
+    start, seen, truth = observed.without(held).start(), observed.seen(held), observed.values[:, held]
+    weight = observed.trust[held] / observed.trust[held].sum(dtype=float)
 
     def curve(flow: Flow, beta: float) -> Curve:
         rival = min(curves, key=lambda c: c.error, default=None)
-        watch = _Watch(course.kind, held, truth, weight, rival, to_end=not stop)
+        watch = _Watch(course.kind, seen, truth, weight, rival, to_end=not stop)
         try:
             course.run(
                 start, flow, Schedule(np.full(iterations, beta), course.dt), stop=watch, most_substeps=MOST_SUBSTEPS
@@ -180,19 +156,29 @@ def choose(
 
 
 class _Watch:
-    """Follows the error at the held-out entries (H,) and says when nothing more is to be seen (never, with to_end)."""
+    """Follows the error at the held-out places and says when nothing more is to come (never, with to_end).
+
+    seen: gives the band's values there, of which `truth` (K, H) are the data of weights `weight` (H,).
+    """
 
     def __init__(
-        self, kind: Kind, held: np.ndarray, truth: np.ndarray, weight: np.ndarray, rival: Curve | None, *, to_end: bool
+        self,
+        kind: Kind,
+        seen: Callable[[np.ndarray], np.ndarray],
+        truth: np.ndarray,
+        weight: np.ndarray,
+        rival: Curve | None,
+        *,
+        to_end: bool,
     ) -> None:
-        self.kind, self.held, self.truth, self.weight, self.to_end = kind, held, truth, weight, to_end
+        self.kind, self.seen, self.truth, self.weight, self.to_end = kind, seen, truth, weight, to_end
         self.longest = (np.inf, 0.0) if rival is None else (RIVAL[0] * rival.iterations + RIVAL[1], rival.error)
         self.errors: list[float] = []
         self.least = 0
         self.first = self.best = np.empty(0)
 
     def __call__(self, k: int, u: np.ndarray) -> str | None:
-        each = self.kind.errors(u[:, self.held], self.truth)
+        each = self.kind.errors(self.seen(u), self.truth)
         self.errors.append(float(self.weight @ each))
         if k == 0:
             self.first = self.best = each
@@ -205,8 +191,8 @@ class _Watch:
     @property
     def gain(self) -> float:
         """How much less the error is than at the start, in standard errors of that difference."""
-        fall = (self.first - self.best) * self.weight * len(self.held)
-        spread = float(fall.std()) / np.sqrt(len(self.held))
+        fall = (self.first - self.best) * self.weight * len(self.weight)
+        spread = float(fall.std()) / np.sqrt(len(self.weight))
         return float(fall.mean()) / spread if spread > 0 else 0.0
 
 
@@ -229,42 +215,28 @@ def search(error: Callable[[float], float]) -> None:
         x = nearest
 
 
-def near_surface(band: Band, trust: np.ndarray) -> np.ndarray:
-    """Entries (N,) of valid voxels within half a voxel of the surface, where input and output show the same place."""
-    return np.flatnonzero((trust > 0) & (np.abs(band.distance) <= 0.5 * band.grid.used_spacing.max()))
-
-
-def discrepancy(course: Course, own: np.ndarray, trust: np.ndarray, sigma: float) -> Stop:
+def discrepancy(observed: Observed, sigma: float) -> Stop:
     """Stops where the flow's values have left the data by the noise's standard deviation sigma (data units).
 
-    Morozov's principle. own: (K, E) of weights trust (E,). Raises DataError where no valid voxel is near the surface.
+    Morozov's principle. Raises DataError where there are no valid data on the surface.
     """
-    near = near_surface(course.band, trust)
-    if not len(near):
-        raise DataError("stop discrepancy: found no valid voxel within half a voxel of the surface; give --iterations")
-    data = own[:, near]
-    return lambda k, u: "discrepancy" if course.kind.spread(data, u[:, near]) >= sigma else None
+    near = _near(observed, "discrepancy")
+    data, seen, kind = observed.values[:, near], observed.seen(near), observed.kind
+    return lambda k, u: "discrepancy" if kind.spread(data, seen(u)) >= sigma else None
 
 
-def decorrelated(
-    course: Course, own: np.ndarray, trust: np.ndarray, start: Extended, flow: Flow, beta: float, iterations: int
-) -> int:
+def decorrelated(course: Course, observed: Observed, start: Extended, flow: Flow, beta: float, iterations: int) -> int:
     """The iteration at which what was removed from the data is least correlated with what is left (Mrazek, Navara).
 
-    own: (K, E) of weights trust (E,), not the start values, which are averages already.
-    Raises DataError where no valid voxel is near the surface.
+    From the data, not the start values, which are averages already. Raises as `discrepancy`.
     """
-    near = near_surface(course.band, trust)
-    if not len(near):
-        raise DataError(
-            "stop decorrelation: found no valid voxel within half a voxel of the surface; give --iterations"
-        )
-    data = own[:, near].astype(float)
+    near = _near(observed, "decorrelation")
+    data, seen = observed.values[:, near].astype(float), observed.seen(near)
     found: list[float] = [np.inf]  # at the start nothing is removed
 
     def watch(k: int, u: np.ndarray) -> str | None:
         if k:
-            left = u[:, near].astype(float)
+            left = seen(u).astype(float)
             removed = data - left
             left, removed = (x - x.mean(1, keepdims=True) for x in (left, removed))
             size = np.sqrt((left**2).sum() * (removed**2).sum())
@@ -273,3 +245,12 @@ def decorrelated(
 
     course.run(start, flow, Schedule(np.full(iterations, beta), course.dt), stop=watch)
     return int(np.argmin(found))
+
+
+def _near(observed: Observed, rule: str) -> np.ndarray:
+    near = observed.near()
+    if not len(near):
+        raise DataError(
+            f"stop {rule}: found no valid {observed.places} within half a voxel of the surface; give --iterations"
+        )
+    return near

@@ -24,6 +24,7 @@ from beltrami_cli.extension import own_samples
 from beltrami_cli.flows import DT_SHARE, Flow, stability_bound, typical_slope
 from beltrami_cli.kinds import Kind
 from beltrami_cli.metrics import difference
+from beltrami_cli.observed import AtVoxels
 from beltrami_cli.phantoms import Phantom, torus
 
 MAPS, SIGMAS = ("smooth", "pieces", "mixed"), (10, 20, 40)
@@ -84,7 +85,7 @@ class Case:
         band = build_band(phantom.levelset, grid, DEFAULT_BAND)
         course = Course(band, Kind(), DT_SHARE * stability_bound(grid.spacing, grid.shape))
         own = own_samples(band, band.gather(phantom.noisy.astype(np.float32))[None])
-        start = course.start(own, np.isfinite(own[0]).astype(np.float32))
+        start = AtVoxels(band, course.kind, own, np.isfinite(own[0]).astype(np.float32)).start()
         slope = typical_slope(band, start.values, start.known)
         near = band.primary[np.abs(band.gather(phantom.levelset)[band.primary]) < 0.5]
         clean = band.gather(phantom.clean)[near]

@@ -19,8 +19,9 @@ from beltrami_cli.extension import own_samples
 from beltrami_cli.flows import Flow, typical_slope
 from beltrami_cli.grid import Grid
 from beltrami_cli.kinds import Kind
+from beltrami_cli.observed import NEAR_SHARE, SHELL_SHARE, AtVoxels
 from beltrami_cli.phantoms import Phantom, torus
-from beltrami_cli.tuning import LAST_STEP, LEAST_HELD, NEAR_SHARE, SEARCH_RANGE, SHELL_SHARE, hold_out, search
+from beltrami_cli.tuning import LAST_STEP, LEAST_HELD, SEARCH_RANGE, hold_out, search
 
 DT = 0.15  # mm^2, the default on voxels of 1 mm
 CASES = [(map_, sigma) for map_ in ("smooth", "pieces", "mixed") for sigma in (10.0, 20.0, 40.0)]
@@ -58,7 +59,7 @@ class Bench:
         self.band = build_band(made.levelset, made.grid, 4.0)
         own = own_samples(self.band, self.band.gather(made.noisy)[None])
         self.course = Course(self.band, Kind(), DT)
-        self.start = self.course.start(own, (~np.isnan(own[0])).astype(own.dtype))
+        self.start = AtVoxels(self.band, Kind(), own, (~np.isnan(own[0])).astype(own.dtype)).start()
         self.slope = typical_slope(self.band, self.start.values, self.start.known)
         primary = self.band.primary
         self.near = primary[np.abs(self.band.gather(made.levelset)[primary]) < 0.5]
@@ -84,6 +85,10 @@ def bench(map_: str, sigma: float) -> Bench:
     return Bench(scene(map_, sigma))
 
 
+def trusting(band: Band, trust: np.ndarray) -> AtVoxels:
+    return AtVoxels(band, Kind(), np.where(trust > 0, 1.0, np.nan)[None], trust)
+
+
 # --- what is held out -------------------------------------------------------------------------------------------------
 
 
@@ -94,7 +99,7 @@ def band() -> Band:
 
 
 def test_held_out_are_a_share_of_the_voxels_1_to_2_voxels_from_the_surface(band):
-    held = hold_out(Course(band, Kind(), 0.15), np.ones(band.entries), 0)
+    held = hold_out(trusting(band, np.ones(band.entries)), 0)
     shell = np.flatnonzero((np.abs(band.distance) >= 1) & (np.abs(band.distance) < 2))
     assert len(held) == round(SHELL_SHARE * len(shell)) > 400
     assert np.all(np.diff(held) > 0) and np.isin(held, shell).all()
@@ -104,7 +109,7 @@ def test_held_out_are_a_share_of_the_voxels_1_to_2_voxels_from_the_surface(band)
 
 def test_held_out_by_seed(band):
     trust = np.ones(band.entries)
-    first, again, other = (hold_out(Course(band, Kind(), 0.15), trust, seed) for seed in (0, 0, 1))
+    first, again, other = (hold_out(trusting(band, trust), seed) for seed in (0, 0, 1))
     assert np.array_equal(first, again)
     assert len(np.intersect1d(first, other)) == pytest.approx(SHELL_SHARE * len(first), rel=0.3)
 
@@ -112,12 +117,12 @@ def test_held_out_by_seed(band):
 def test_held_out_hold_data(band):
     trust = np.random.default_rng(0).random(band.entries).astype(np.float32)
     trust[trust < 0.6] = 0
-    assert np.all(trust[hold_out(Course(band, Kind(), 0.15), trust, 0)] > 0)
+    assert np.all(trust[hold_out(trusting(band, trust), 0)] > 0)
 
 
 def test_held_out_beside_the_surface_where_data_end_there(band):
     trust = (np.abs(band.distance) < 1.05).astype(float)
-    held = hold_out(Course(band, Kind(), 0.15), trust, 0)
+    held = hold_out(trusting(band, trust), 0)
     inner = np.abs(band.distance) < 1
     assert np.abs(band.distance[held]).max() < 1 and len(held) == round(NEAR_SHARE * inner.sum())
 
@@ -125,7 +130,7 @@ def test_held_out_beside_the_surface_where_data_end_there(band):
 def test_shell_counts_in_the_largest_voxels():
     psi = ball((24, 24, 24), 8.0)
     wide = build_band(psi, Grid.from_spacing(psi.shape, (0.5, 1.0, 1.0)), 4.0)
-    held = np.abs(wide.distance[hold_out(Course(wide, Kind(), 0.15), np.ones(wide.entries), 0)])
+    held = np.abs(wide.distance[hold_out(trusting(wide, np.ones(wide.entries)), 0)])
     assert 1 <= held.min() < 1.1 and 1.9 < held.max() < 2
 
 
@@ -133,7 +138,7 @@ def test_too_few_to_hold_out(band):
     few = np.zeros(band.entries)
     few[np.flatnonzero((np.abs(band.distance) > 1.2) & (np.abs(band.distance) < 1.8))[: 2 * LEAST_HELD - 4]] = 1
     with pytest.raises(DataError, match=r"56 valid voxels.*hold out 28.*at least 30.*--beta and --iterations"):
-        hold_out(Course(band, Kind(), 0.15), few, 0)
+        hold_out(trusting(band, few), 0)
 
 
 # --- the search -------------------------------------------------------------------------------------------------------

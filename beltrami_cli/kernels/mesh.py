@@ -258,3 +258,109 @@ def principal_curvatures(points, normals, start, ring, limit, ridge):
         curvature[v, 1] = min(max(mean - spread, -limit), limit)
         direction[v] = np.cos(angle) * e1 + np.sin(angle) * e2
     return curvature, direction
+
+
+@nb.njit(cache=True)
+def faces_around(cells, vertices):
+    """The triangles (C, 3) around each of so many vertices: CSR (start, face)."""
+    start = np.zeros(vertices + 1, np.int64)
+    for c in range(len(cells)):
+        for k in range(3):
+            start[cells[c, k] + 1] += 1
+    start = np.cumsum(start)
+    face, filled = np.empty(start[-1], np.int32), start[:-1].copy()
+    for c in range(len(cells)):
+        for k in range(3):
+            v = cells[c, k]
+            face[filled[v]] = c
+            filled[v] += 1
+    return start, face
+
+
+@nb.njit(cache=True)
+def barycentric(p, a, b, c, w):
+    """Weights w (3,) of the corners for the point of triangle abc nearest to p; returns its squared distance."""
+    # By the regions of Ericson, Real-Time Collision Detection (2005), Sec. 5.1.5.
+    ab0, ab1, ab2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    ac0, ac1, ac2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    ap0, ap1, ap2 = p[0] - a[0], p[1] - a[1], p[2] - a[2]
+    d1, d2 = ab0 * ap0 + ab1 * ap1 + ab2 * ap2, ac0 * ap0 + ac1 * ap1 + ac2 * ap2
+    bb, bc, cc = ab0 * ab0 + ab1 * ab1 + ab2 * ab2, ab0 * ac0 + ab1 * ac1 + ab2 * ac2, ac0 * ac0 + ac1 * ac1 + ac2 * ac2
+    d3, d4, d5, d6 = d1 - bb, d2 - bc, d1 - bc, d2 - cc
+    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
+    if d1 <= 0 and d2 <= 0:
+        v, t = 0.0, 0.0
+    elif d3 >= 0 and d4 <= d3:
+        v, t = 1.0, 0.0
+    elif d6 >= 0 and d5 <= d6:
+        v, t = 0.0, 1.0
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        v, t = (d1 / (d1 - d3) if d1 > d3 else 0.0), 0.0
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        v, t = 0.0, (d2 / (d2 - d6) if d2 > d6 else 0.0)
+    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
+        total = (d4 - d3) + (d5 - d6)
+        t = (d4 - d3) / total if total > 0 else 0.0
+        v = 1 - t
+    else:
+        v, t = vb / (va + vb + vc), vc / (va + vb + vc)
+    w[0], w[1], w[2] = 1 - v - t, v, t
+    q0, q1, q2 = ap0 - v * ab0 - t * ac0, ap1 - v * ab1 - t * ac1, ap2 - v * ab2 - t * ac2
+    return q0 * q0 + q1 * q1 + q2 * q2
+
+
+@nb.njit(cache=True, parallel=True)
+def nearest_on_faces(queries, vertex, points, cells, start, face):
+    """For each query (Q, 3) the corners (Q, 3) and weights (Q, 3) of the nearest point of the faces around `vertex`.
+
+    vertex: (Q,) the mesh vertex that the query belongs to; start, face: of `faces_around`. Weights of 0 where it has
+    no face.
+    """
+    corners, weights = np.zeros((len(queries), 3), np.int32), np.zeros((len(queries), 3))
+    for q in nb.prange(len(queries)):
+        best = np.inf
+        w = np.empty(3)
+        for f in range(start[vertex[q]], start[vertex[q] + 1]):
+            i, j, k = cells[face[f], 0], cells[face[f], 1], cells[face[f], 2]
+            apart = barycentric(queries[q], points[i], points[j], points[k], w)
+            if apart < best:
+                best = apart
+                corners[q, 0], corners[q, 1], corners[q, 2] = i, j, k
+                weights[q] = w
+    return corners, weights
+
+
+@nb.njit(cache=True)
+def onward(points, start, ring, before, here):
+    """The neighbour of `here` that best keeps the direction from `before`; -1 where all lie behind."""
+    following, best = -1, 0.0
+    for q in range(start[here], start[here + 1]):
+        w = ring[q]
+        dot, size = 0.0, 0.0
+        for k in range(3):
+            dot += (points[w, k] - points[here, k]) * (points[here, k] - points[before, k])
+            size += (points[w, k] - points[here, k]) ** 2
+        if size > 0 and dot / np.sqrt(size) > best:
+            following, best = w, dot / np.sqrt(size)
+    return following
+
+
+@nb.njit(cache=True)
+def straight_walks(points, start, ring, steps):
+    """Vertices met on the straightest way over the mesh from each vertex: (V, 2, steps), forth and back; -1 at an end.
+
+    Forth to the ring's first, back to the one most opposite to it, and on to the one that keeps the direction best.
+    """
+    out = np.full((len(points), 2, steps), -1, np.int64)
+    for v in range(len(points)):
+        if start[v] == start[v + 1]:
+            continue
+        out[v, 0, 0] = ring[start[v]]
+        out[v, 1, 0] = onward(points, start, ring, ring[start[v]], v)
+        for side in range(2):
+            for step in range(1, steps):
+                if out[v, side, step - 1] < 0:
+                    break
+                before = out[v, side, step - 2] if step > 1 else v
+                out[v, side, step] = onward(points, start, ring, before, out[v, side, step - 1])
+    return out

@@ -81,8 +81,8 @@ def grow(shape, spacing, points, normals, start, ring, half_width):
     """All entries of the band, in order of growth: a voxel's entries are head[x], after[head[x]], ... to -1.
 
     A voxel has an entry for every sheet of the surface that it lies along the normal of, within `half_width` (mm): the
-    vertex is a local minimum of the distance over the mesh. Growth starts at the voxels beside the vertices and
-    passes each vertex on to the neighbours of its voxel, from where it descends to theirs.
+    vertex is a local minimum of the distance over the mesh. Growth starts at the voxels beside the vertices (those
+    that have faces) and passes each vertex on to the neighbours of its voxel, from where it descends to theirs.
     Returns voxel (E,), vertex (E,), squared distance (E,), after (E,), head (X,).
     """
     stride = (shape[1] * shape[2], shape[2], 1)
@@ -101,6 +101,8 @@ def grow(shape, spacing, points, normals, start, ring, half_width):
                 i = points[v, a] / spacing[a]
                 at[a] = int(np.floor(i + 1e-6)) if seeds % 2 == 0 else int(np.ceil(i - 1e-6))
             seeds += 1
+            if start[v] == start[v + 1]:
+                continue
         else:
             v, x, moves = vertex[grown], voxel[grown], MOVES[1:]
             at[0], at[1], at[2] = x // stride[0], x // stride[1] % shape[1], x % shape[2]
@@ -234,26 +236,27 @@ def mutual_links(forward, backward):
 
 
 @nb.njit(cache=True, parallel=True)
-def entries_at_vertices(voxel, vertex, first, shape, spacing, points, ijk):
-    """For each mesh vertex the entry of its own sheet beside it (V,), -1 where none, and the offset (3, V) from it.
+def entries_at_points(voxel, vertex, first, shape, spacing, points, ijk, own):
+    """For points (N, 3) in voxels the entry of their own sheet beside them (N,), -1 where none, and the offset (3, N).
 
-    Of the entries in the eight voxels around, the one whose own vertex is nearest.
+    own: (N,) the mesh vertex of each point's sheet. Of the entries in the eight voxels around, the one whose vertex is
+    nearest to it.
     """
     start, offset = np.full(len(ijk), -1, np.int32), np.zeros((3, len(ijk)), np.float32)
     per_voxel = 1 / spacing
-    for v in nb.prange(len(ijk)):
+    for n in nb.prange(len(ijk)):
         best = LINK_VOXELS**2
         for corner in range(8):
-            i = int(ijk[v, 0]) + (corner >> 2)
-            j = int(ijk[v, 1]) + (corner >> 1 & 1)
-            k = int(ijk[v, 2]) + (corner & 1)
-            if i >= shape[0] or j >= shape[1] or k >= shape[2]:
+            i = int(np.floor(ijk[n, 0])) + (corner >> 2)
+            j = int(np.floor(ijk[n, 1])) + (corner >> 1 & 1)
+            k = int(np.floor(ijk[n, 2])) + (corner & 1)
+            if i < 0 or j < 0 or k < 0 or i >= shape[0] or j >= shape[1] or k >= shape[2]:
                 continue
             x = (i * shape[1] + j) * shape[2] + k
             for e in range(first[x], first[x + 1]):
-                apart = squared_voxels(points, vertex[e], v, per_voxel)
+                apart = squared_voxels(points, vertex[e], own[n], per_voxel)
                 if apart < best:
                     best = apart
-                    start[v] = e
-                    offset[0, v], offset[1, v], offset[2, v] = ijk[v, 0] - i, ijk[v, 1] - j, ijk[v, 2] - k
+                    start[n] = e
+                    offset[0, n], offset[1, n], offset[2, n] = ijk[n, 0] - i, ijk[n, 1] - j, ijk[n, 2] - k
     return start, offset
