@@ -6,11 +6,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
-__all__ = ["Result", "__version__", "denoise"]
+__all__ = ["Mesh", "Result", "__version__", "denoise"]
 
 if TYPE_CHECKING:
     from beltrami_cli.api import denoise
     from beltrami_cli.solver import Result
+    from beltrami_cli.surface import Mesh
 
 
 def __getattr__(name: str) -> Any:

@@ -13,28 +13,35 @@ from beltrami_cli.config import Settings, parse_spacing
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.grid import Grid
-from beltrami_cli.inputs import Warnings
+from beltrami_cli.inputs import Warnings, grid_around
 from beltrami_cli.progress import Phases
 from beltrami_cli.solver import Result, Solver
+from beltrami_cli.surface import Mesh
 
 
 def denoise(
-    levelset: np.ndarray | None,
+    levelset: np.ndarray | Mesh | None,
     data: np.ndarray,
     *,
     weights: np.ndarray | None = None,
     mask: np.ndarray | None = None,
     affine: np.ndarray | None = None,
     spacing: float | Sequence[float] | None = None,
+    on: Sequence[Mesh] = (),
     observer: Observer | None = None,
     **options: Any,
 ) -> Result:
-    """Denoise data that lie on the zero level of a level set.
+    """Denoise data that lie on the zero level of a level set, or on a mesh.
 
-    levelset: Psi, (nx, ny, nz), or (nx, ny) for a curve in a plane; negative inside; None with flat=True.
-    data: values of the same shape, NaN where missing; with kind="vector" complex, or of shape (..., K).
-    weights: confidence of the data, of Psi's shape, 0 or more (R^2, coherence). mask: alike, which data count (not 0).
-    affine: (4, 4), voxel indices to RAS mm; or spacing: mm, one number or one per axis (default 1).
+    levelset: Psi, (nx, ny, nz), or (nx, ny) for a curve in a plane; negative inside; a mask, not 0 inside; a Mesh in
+        RAS mm; None with flat=True.
+    data: values of the same shape, NaN where missing; with kind="vector" complex, or of shape (..., K). On a Mesh of V
+        vertices of shape (V,) or (V, K), or a volume around it.
+    weights: confidence of the data, of the shape of one channel, 0 or more (R^2, coherence). mask: alike, which data
+        count (not 0).
+    affine: (4, 4), voxel indices to RAS mm; or spacing: mm, one number or one per axis (default 1); for values at
+        vertices, spacing alone: that of the band's voxels (default: the mesh's median edge).
+    on: other meshes of the surface, in RAS mm, whose vertices get values too, `Result.on`.
     observer: called after every iteration with (iteration, iterations, root mean square change).
     options: the fields of `config.Settings`, such as flow="beltrami", beta=0.05, iterations=20.
 
@@ -46,13 +53,23 @@ def denoise(
     for name in options.keys() - {field.name for field in fields(Settings)}:
         raise RefusedError(f"unknown option {name!r}; the options are the fields of config.Settings")
     settings = Settings(**options)
-    values, psi = _filled_with_nan(data), None if levelset is None else _filled_with_nan(levelset)
-    if settings.flat != (psi is None):
-        raise RefusedError("levelset: expected an array, or None together with flat=True")
-    shape = _shape(values, psi, settings)
+    if settings.flat != (levelset is None):
+        raise RefusedError("levelset: expected an array or a Mesh, or None together with flat=True")
+    values, psi = _filled_with_nan(data), None
+    if isinstance(levelset, np.ndarray | list | tuple):
+        psi = _filled_with_nan(np.asanyarray(levelset))
+    mesh = levelset if isinstance(levelset, Mesh) else None
+    at_vertices = mesh is not None and values.ndim < 3
+    shape = _shape(values, len(mesh.vertices_ras_mm) if mesh else None, psi, settings)
     if affine is not None and spacing is not None:
         raise RefusedError("affine and spacing both place the voxels; give one of them")
-    grid = _grid(shape, affine, spacing)
+    if affine is not None and at_vertices:
+        raise RefusedError("affine: places voxels; found values at the vertices of a mesh; drop it")
+    if mesh is not None and at_vertices:
+        grid, full = grid_around(mesh, settings, _one(spacing)), shape
+    else:
+        grid = _grid(shape, affine, spacing)
+        full = grid.shape
     channels = values.shape[len(shape) :]
 
     def on_grid(array: np.ndarray | None, name: str, complex_too: bool = False) -> np.ndarray | None:
@@ -60,7 +77,7 @@ def denoise(
             return None
         if array.shape[: len(shape)] != shape or (array.ndim > len(shape) and array is not values):
             raise RefusedError(f"{name}: found the shape {array.shape}; expected {shape}, as DATA has")
-        return _as_float(array, settings, complex_too).reshape(grid.shape + array.shape[len(shape) :])
+        return _as_float(array, settings, complex_too).reshape(full + array.shape[len(shape) :])
 
     placed = on_grid(values, "data", settings.kind == "vector")
     assert placed is not None
@@ -68,11 +85,12 @@ def denoise(
     warnings = Warnings(None)
     try:
         solver = Solver(
-            on_grid(psi, "levelset"), grid, settings, Phases(), warnings,
+            mesh or on_grid(psi, "levelset"), grid, settings, Phases(), warnings,
             on_grid(None if weights is None else _filled_with_nan(weights), "weights"),
             on_grid(None if mask is None else _filled_with_nan(mask), "mask"),
+            at_vertices=at_vertices, on=on,
         )  # fmt: skip
-        solved = _frames(solver, placed) if settings.independent else solver.denoise(placed, observer)
+        solved = solver.denoise_series(placed) if settings.independent else solver.denoise(placed, observer)
     finally:
         numba.set_num_threads(threads)  # the caller's own choice
     return replace(
@@ -83,18 +101,6 @@ def denoise(
     )
 
 
-def _frames(solver: Solver, data: np.ndarray) -> Result:
-    """Every frame of data (nx, ny, nz, K) on its own."""
-    record: dict[str, Any] = {}
-    results = list(solver.denoise_frames(data.shape[3], lambda t: data[..., t], record))
-    meshes = [result.mesh for result in results if result.mesh is not None]
-    mesh = None
-    if meshes:
-        mesh = replace(meshes[0], values=np.stack([m.values for m in meshes if m.values is not None], -1))
-    filled = np.logical_or.reduce([r.filled for r in results])
-    return Result(np.stack([r.data for r in results], -1), mesh, filled, record, ())
-
-
 def _filled_with_nan(array: np.ndarray) -> np.ndarray:
     """A masked array's masked values as NaN; others as they are."""
     if isinstance(array, np.ma.MaskedArray):
@@ -102,11 +108,26 @@ def _filled_with_nan(array: np.ndarray) -> np.ndarray:
     return np.asarray(array)
 
 
-def _shape(values: np.ndarray, psi: np.ndarray | None, settings: Settings) -> tuple[int, ...]:
+def _one(spacing: float | Sequence[float] | None) -> float | None:
+    """The spacing of the band around a mesh, whose voxels are cubes."""
+    if spacing is None:
+        return None
+    steps = parse_spacing(np.asarray(spacing).tolist())
+    if len(steps) > 1:
+        raise RefusedError(f"spacing: found {spacing}; expected one number: the band around a mesh has cubes")
+    return steps[0]
+
+
+def _shape(values: np.ndarray, vertices: int | None, psi: np.ndarray | None, settings: Settings) -> tuple[int, ...]:
     """The shape of one channel; raises RefusedError where levelset and data do not go together."""
     vector = settings.kind == "vector" and not np.iscomplexobj(values)
     shape = values.shape
-    if psi is not None:
+    if vertices is not None and values.ndim < 3:
+        if shape[:1] != (vertices,) or (values.ndim == 2) != vector:
+            more = ", or (V, K) with kind='vector'" if values.ndim == 2 else ""
+            raise RefusedError(f"data: found the shape {shape}; expected ({vertices},), as the mesh has vertices{more}")
+        shape = shape[:1]
+    elif psi is not None:
         shape = psi.shape
         fits = values.shape == shape or (vector and values.shape[:-1] == shape)
         if not fits:
@@ -116,7 +137,7 @@ def _shape(values: np.ndarray, psi: np.ndarray | None, settings: Settings) -> tu
             )
     elif vector and values.ndim > 2:
         shape = values.shape[:-1]
-    if len(shape) not in (2, 3):
+    if len(shape) not in (2, 3) and vertices is None:
         raise RefusedError(f"data: found an array of shape {values.shape}; expected 2 or 3 axes")
     if settings.independent and values.shape == shape:
         raise RefusedError(f"independent: found data of shape {values.shape}; expected several frames, (..., K)")

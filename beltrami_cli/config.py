@@ -380,8 +380,12 @@ def _require_countable(name: str, iterations: float) -> None:
 class Job:
     """One run: which files, and how. mesh: None for one beside the volume, () for none.
 
-    weights: how much each data voxel counts (>= 0); mask: which data voxels count at all (not 0). filled: where the
-    mask of the voxels that the run filled in is written.
+    levelset: a level-set volume, a segmentation (of which `labels` are inside, or whose surface runs `between` two) or
+    a surface, whose coordinates are those of `frame` ("scanner", "tkr", None for what the file says).
+    data: a volume, or, on a surface, values at its vertices; map: which of several maps, by name or number from 1.
+    weights: how much each voxel or vertex counts (>= 0); mask: which count at all (not 0). filled: where the mask of
+    what the run filled in is written. on: surfaces, and where values at their vertices are written. structure: in
+    GIFTI's names, of what is written. spacing: mm, of .npy inputs; for values at vertices, of the band's voxels.
     """
 
     data: Path
@@ -391,6 +395,12 @@ class Job:
     weights: Path | None = None
     mask: Path | None = None
     filled: Path | None = None
+    on: tuple[tuple[Path, Path], ...] = ()
+    labels: str | None = None
+    between: str | None = None
+    map: str | None = None
+    frame: str | None = None
+    structure: str | None = None
     spacing: tuple[float, ...] | None = None
     resample: bool = False
     overwrite: bool = False
@@ -405,6 +415,12 @@ class Job:
             raise RefusedError("flat: there is no surface, so there is no mesh to write; drop --mesh")
         if self.settings.flat and self.resample:
             raise RefusedError("flat: there is no level set's grid to resample onto; drop --resample")
+        if self.settings.flat and (self.on or self.labels or self.between):
+            raise RefusedError("flat: there is no surface; drop --on, --labels and --between")
+        if self.labels and self.between:
+            raise RefusedError("labels and between both say where in LEVELSET the surface is; give one of them")
+        if self.frame not in ("scanner", "tkr", None):
+            raise RefusedError(f"frame: found {self.frame!r}; expected scanner or tkr")
 
     @property
     def inputs(self) -> list[Path]:
@@ -413,16 +429,21 @@ class Job:
 
     @property
     def all_inputs(self) -> list[Path]:
-        """LEVELSET and DATA, then weights and mask: those there are."""
-        return [*self.inputs, *(path for path in (self.weights, self.mask) if path is not None)]
+        """LEVELSET and DATA, then weights and mask, those there are, and the surfaces to put values on."""
+        trust = (path for path in (self.weights, self.mask) if path is not None)
+        return [*self.inputs, *trust, *(surface for surface, _ in self.on)]
 
 
 # What a config file may say: section, key and the field of Job or Settings that it sets.
 KEYS: dict[str, dict[str, str]] = {
     "input": {
-        k: k for k in ("levelset", "data", "weights", "mask", "missing", "fill", "spacing", "resample", "inside")
+        **{
+            k: k
+            for k in ("levelset", "labels", "between", "frame", "data", "map", "weights", "mask", "missing", "fill")
+        },
+        **{k: k for k in ("spacing", "resample", "inside")},
     },
-    "output": {k: k for k in ("volume", "mesh", "filled", "outside", "overwrite", "precision")},
+    "output": {k: k for k in ("volume", "mesh", "filled", "on", "structure", "outside", "overwrite", "precision")},
     "flow": {"name": "flow", **{k: k for k in ("phi", "beta", "edge", "eps", "scheme", "dt", "flat", "fidelity")}},
     "time": {k: k for k in ("iterations", "time", "fwhm", "stop", "noise_sigma", "seed")},
     "band": {"half_width": "band", **{k: k for k in ("extension", "extend_every", "depth")}},
@@ -487,7 +508,10 @@ def overlaid(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
         own = {"circular": "period", "vector": "independent"}.get(over["kind"])
         displaced |= {"period", "independent"} - {own}
     if over.get("flat"):
-        displaced |= {"levelset", "mesh", "resample", "band", "extension", "extend_every", "depth"}
+        displaced |= {"levelset", "mesh", "on", "labels", "between", "resample"}
+        displaced |= {"band", "extension", "extend_every", "depth"}
+    if {"labels", "between"} & over.keys():
+        displaced |= {"labels", "between"}
     return {**{k: v for k, v in base.items() if k not in displaced}, **over}
 
 
@@ -500,6 +524,17 @@ def parse_spacing(given: Any) -> tuple[float, ...]:
     if len(values) not in (1, 2, 3) or not all(math.isfinite(v) and v > 0 for v in values):
         raise RefusedError(f"spacing: found {given!r}; expected one number above 0 (mm), or one per axis: SX,SY,SZ")
     return values
+
+
+def parse_on(given: str, folder: Path = Path()) -> tuple[Path, Path]:
+    """A surface and the file for the values at its vertices from "SURFACE=FILE", both relative to `folder`.
+
+    Raises RefusedError for anything else.
+    """
+    surface, equals, file = given.partition("=")
+    if not (surface and equals and file):
+        raise RefusedError(f"on: found {given!r}; expected SURFACE=FILE, as in lh.mid.surf.gii=lh.map.func.gii")
+    return folder / surface, folder / file
 
 
 def _numbers(given: Any) -> tuple[float, ...]:
@@ -524,6 +559,13 @@ def _from_toml(path: Path, section: str, key: str, value: Any) -> Any:
         return tuple(_path(path, where, name) for name in names)
     if key in ("levelset", "data", "weights", "mask", "volume", "filled"):
         return _path(path, where, value)
+    if key == "on":
+        pairs = value if isinstance(value, list) else [value]
+        if not all(isinstance(pair, str) for pair in pairs):
+            raise RefusedError(f"{where}: found {value!r}; expected SURFACE=FILE, or a list of them")
+        return tuple(parse_on(pair, path.parent) for pair in pairs)
+    if key in ("labels", "between", "map"):
+        return ",".join(map(str, value)) if isinstance(value, list) else str(value)
     if key == "spacing":
         return parse_spacing(value)
     if key == "beta":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -75,18 +76,53 @@ class Grid:
 
     def matches(self, other: Grid) -> bool:
         """Same shape, and every corner at the same place within `CORNER_TOLERANCE`."""
-        if self.shape != other.shape:
-            return False
-        last = np.array(self.shape) - 1
-        corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * last
-        shift = np.abs(self.to_world(corners) - other.to_world(corners)).max()
-        return bool(shift <= CORNER_TOLERANCE * self.spacing.min())
+        return self.shape == other.shape and self.apart(other) <= CORNER_TOLERANCE * self.spacing.min()
+
+    def apart(self, other: Grid) -> float:
+        """How far a corner of this grid is in mm, at most, from the same corner of another of the same shape."""
+        return float(np.linalg.norm(self.corners() - other.corners(), axis=1).max())
+
+    def corners(self) -> np.ndarray:
+        """(8, 3) centres of the outermost voxels in RAS mm."""
+        ends = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+        return self.to_world(ends * (np.array(self.shape) - 1))
 
     def describe(self) -> str:
         """One line: shape, spacing, orientation matrix and origin, for messages."""
         steps = " x ".join(f"{s:.4g}" for s in self.spacing)
         rows = "; ".join(" ".join(f"{v:.5g}" for v in row) for row in self.affine[:3])
         return f"{' x '.join(map(str, self.shape))} voxels of {steps} mm, affine [{rows}]"
+
+
+class Canonical:
+    """Brings voxel axes into one order and direction, and back: towards R, A, S, a plane's missing axis last.
+
+    How a volume is stored must not show in what is computed from it: which way marching cubes halves a quad, which of
+    two equals comes first and where seeded draws fall all go by the order of the voxels.
+
+    grid: the same voxels with their axes in that order.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        axes = grid.affine[:3, :3] / grid.spacing
+        # The world axis that each voxel axis is nearest to, no two the same one.
+        world = max(permutations(range(3)), key=lambda nearest: sum(abs(axes[w, v]) for v, w in enumerate(nearest)))
+        self._order = sorted(range(3), key=lambda v: (grid.shape[v] == 1, world[v]))
+        self._flips = tuple(k for k, v in enumerate(self._order) if axes[world[v], v] < 0)
+        a, b, c = (grid.shape[v] for v in self._order)
+        affine = grid.affine[:, [*self._order, 3]]
+        for k in self._flips:
+            affine[:, 3] += affine[:, k] * ((a, b, c)[k] - 1)
+            affine[:, k] *= -1
+        self.grid = Grid((a, b, c), affine)
+
+    def forth(self, array: np.ndarray) -> np.ndarray:
+        """A view of values (nx, ny, nz, ...) on the grid as given, with their axes as those of `self.grid`."""
+        return np.flip(array.transpose(*self._order, *range(3, array.ndim)), self._flips)
+
+    def back(self, array: np.ndarray) -> np.ndarray:
+        """The reverse of `forth`."""
+        return np.flip(array, self._flips).transpose(*np.argsort(self._order), *range(3, array.ndim))
 
 
 def require_same_grid(first: Grid, first_name: str, second: Grid, second_name: str, *, remedy: str) -> None:
@@ -108,12 +144,14 @@ class Volume:
     file_shape: the array shape in the file it came from, or should have in a file: planes and trailing axes of length 1
         kept, channels last.
     header: what its file format needs to write a volume like this one; opaque outside `formats`.
+    notes: lines for the user on what the file leaves in doubt, as where its voxels lie.
     """
 
     data: np.ndarray
     grid: Grid
     file_shape: tuple[int, ...] = ()
     header: Any = field(default=None, repr=False)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.data.shape[:3] != self.grid.shape or self.data.ndim > 4:
@@ -129,9 +167,9 @@ class Volume:
         return self.data.shape[3] if self.data.ndim == 4 else 1
 
     def with_data(self, data: np.ndarray) -> Volume:
-        """The same grid and header around other values on it, also where they have more or fewer channels."""
+        """The same grid, header and notes around other values on it, also where they have more or fewer channels."""
         count = data.shape[3] if data.ndim == 4 else 1
-        return Volume(data, self.grid, with_channels(self.file_shape, self.channels, count), self.header)
+        return Volume(data, self.grid, with_channels(self.file_shape, self.channels, count), self.header, self.notes)
 
 
 def with_channels(file_shape: tuple[int, ...], found: int, wanted: int) -> tuple[int, ...]:

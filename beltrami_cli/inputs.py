@@ -6,15 +6,18 @@ from collections.abc import Callable
 
 import numpy as np
 
-from beltrami_cli.band import Band, build_band, flat_band
+from beltrami_cli.band import Band, band_around, build_band, flat_band
 from beltrami_cli.config import Settings
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.flows import DT_SHARE, stability_bound
 from beltrami_cli.grid import Grid
-from beltrami_cli.levelset import two_values
+from beltrami_cli.levelset import refined, two_values
+from beltrami_cli.segmentation import smooth_surface
+from beltrami_cli.surface import Mesh
 
 # Weights below 0 by no more than this share of the largest are rounding and interpolation.
 NEGATIVE_SHARE = 1e-3
+MOST_VOXELS = 2e8  # in the box around a mesh, which costs 8 bytes for each: a hemisphere at 0.2 mm
 
 
 def require_usable(grid: Grid, name: str) -> None:
@@ -37,6 +40,32 @@ def time_step(grid: Grid, settings: Settings) -> float:
             f"{' x '.join(f'{h:.4g}' for h in grid.spacing)} mm; give at most that, or auto"
         )
     return DT_SHARE * bound if settings.dt is None else settings.dt
+
+
+def grid_around(mesh: Mesh, settings: Settings, spacing: float | None = None) -> Grid:
+    """A grid of cubes that holds the band around a mesh, axes as those of RAS.
+
+    spacing: mm; by default the mesh's median edge: as many voxels as vertices, which hold all that values there say.
+    Raises RefusedError where that makes more than MOST_VOXELS of them, DataError where the mesh has no edge.
+    """
+    ras_mm, ends = mesh.vertices_ras_mm[np.unique(mesh.cells)], mesh.cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    lengths = np.linalg.norm(np.subtract(*np.moveaxis(mesh.vertices_ras_mm[ends], 1, 0)), axis=1)
+    lengths = lengths[lengths > 0]
+    if not len(lengths):
+        raise DataError("the surface has no triangle of any area: is it a mesh at all?")
+    h = float(np.median(lengths)) if spacing is None else spacing
+    margin = settings.half_width(np.full(3, h)) + h
+    low, extent = ras_mm.min(0) - margin, np.ptp(ras_mm, axis=0) + 2 * margin
+    shape = np.ceil(extent / h).astype(np.int64) + 1
+    if shape.astype(float).prod() > MOST_VOXELS:
+        raise RefusedError(
+            f"spacing: found voxels of {h:.4g} mm for a surface of {' x '.join(f'{x:.4g}' for x in extent)} mm, "
+            f"which makes {shape.astype(float).prod():.3g} of them; expected at most {MOST_VOXELS:.0e}: give a larger "
+            "--spacing"
+        )
+    affine = np.diag([h, h, h, 1.0])
+    affine[:3, 3] = low
+    return Grid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
 
 
 class PlaneLast:
@@ -70,24 +99,27 @@ class Warnings:
 
 
 def band_of(psi: np.ndarray | None, settings: Settings, plane: PlaneLast, warnings: Warnings) -> Band:
-    """The band around the zero level of psi on the volume's own grid; the flat one where psi is None."""
+    """The band around the zero level of psi on the volume's own grid; the flat one where psi is None.
+
+    Of a mask, the surface is the smooth one of `segmentation.smooth_surface`; in a plane the mask's own staircase.
+    """
     if psi is None:
         return flat_band(plane.grid)
-    psi = _signed(plane.forth(psi), settings, warnings)
-    return build_band(psi, plane.grid, settings.half_width(plane.grid.used_spacing))
-
-
-def _signed(psi: np.ndarray, settings: Settings, warnings: Warnings) -> np.ndarray:
-    """Psi with its negative side inside; a binary mask is centred on 0."""
-    if mask := two_values(psi):
-        low, high = mask
-        warnings.add(
-            f"the level set holds two values only ({low:g} and {high:g}): a mask, whose surface is a staircase of "
-            "voxels, accurate to half a voxel; give a signed distance or another smooth function for a better one"
-        )
-        if low >= 0:  # a mask of something: what it marks is inside, whatever the sign
-            return (low + high) / 2 - psi
-    return -psi if settings.inside == "positive" else psi
+    psi, half_width = plane.forth(psi), settings.half_width(plane.grid.used_spacing)
+    mask = two_values(psi)
+    sign = -1 if settings.inside == "positive" else 1
+    if mask and mask[0] >= 0:  # a mask of something: what it marks is inside, whatever the sign
+        psi, sign = (mask[0] + mask[1]) / 2 - psi, 1
+    if not mask:
+        return build_band(sign * psi, plane.grid, half_width)
+    if 1 not in psi.shape:
+        mesh = smooth_surface(sign * psi < 0, plane.grid, np.isfinite(psi))
+        return band_around(refined(mesh, plane.grid).surface, plane.grid, half_width)
+    warnings.add(
+        f"the level set holds two values only ({mask[0]:g} and {mask[1]:g}): a mask, whose outline is a staircase of "
+        "pixels, accurate to half of one; give a signed distance or another smooth function for a better one"
+    )
+    return build_band(sign * psi, plane.grid, half_width)
 
 
 def trusted(

@@ -1,4 +1,4 @@
-"""Looking at volumes: how two differ, what one holds."""
+"""Looking at files: how two volumes differ; what a volume, a surface or vertex data holds."""
 
 from __future__ import annotations
 
@@ -9,12 +9,18 @@ import numpy as np
 from beltrami_cli import formats
 from beltrami_cli.config import Settings
 from beltrami_cli.errors import BeltramiError, RefusedError
-from beltrami_cli.grid import Volume, require_same_grid
+from beltrami_cli.grid import Grid, Volume, require_same_grid
 from beltrami_cli.inputs import PlaneLast, Warnings, band_of, require_usable
 from beltrami_cli.levelset import crossing_box, two_values
 from beltrami_cli.metrics import Difference, difference
+from beltrami_cli.sources import is_segmentation
+from beltrami_cli.surface import Mesh
 
 REMEDY = "bring them onto one grid first, for example with denoise --resample"
+
+# Of an overlay with many maps, as of a time series, and of many labels only the first are listed.
+MOST_MAPS = 12
+MOST_LABELS = 12
 
 
 def compare_volumes(
@@ -65,6 +71,75 @@ def _near_surface(psi: Volume, name: str, within: float | None) -> np.ndarray:
     return np.asarray(distance <= reach)
 
 
+def describe(path: Path) -> list[str]:
+    """Lines on what a file holds: a surface, vertex data or a volume; raises as their readers."""
+    if formats.is_surface(path):
+        return describe_surface(path)
+    if formats.is_overlay(path):
+        return describe_overlay(path)
+    return describe_volume(path)
+
+
+def describe_surface(path: Path) -> list[str]:
+    """Lines on format, size, place, border and structure of a surface; raises as `formats.read_surface`."""
+    mesh = formats.read_surface(path)
+    points, cells = mesh.vertices_ras_mm, mesh.cells
+    edges, triangles = _edges(cells)
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    border, shared = int((triangles == 1).sum()), int((triangles > 2).sum())
+    extent = " x ".join(f"{low:.4g}..{high:.4g}" for low, high in zip(points.min(0), points.max(0), strict=True))
+    lines = [
+        f"{formats.surface_format(path)} surface, {len(points)} vertices, {len(cells)} triangles, "
+        f"edges of {np.median(length):.3g} mm (median)",
+        f"within {extent} mm (RAS); coordinates: {_frame(path, mesh)}",
+        f"open: {border} border edges" if border else "closed: no border edges",
+        f"structure: {mesh.structure or 'not told'}",
+    ]
+    if shared:
+        lines.append(f"{shared} edges are shared by more than two triangles: expected a surface without branches")
+    if lost := len(points) - len(np.unique(cells)):
+        lines.append(f"{lost} vertices belong to no triangle")
+    return lines
+
+
+def _edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges (N, 2) of triangles, and how many triangles (N,) have each."""
+    ends = np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
+    key, triangles = np.unique(ends[:, 0] << 32 | ends[:, 1], return_counts=True)
+    return np.stack([key >> 32, key & 0xFFFFFFFF], 1), triangles
+
+
+def _frame(path: Path, mesh: Mesh) -> str:
+    """Of which space the vertices are as stored, in words."""
+    if not np.array_equal(formats.read_surface(path, frame="scanner").vertices_ras_mm, mesh.vertices_ras_mm):
+        return "FreeSurfer's surface RAS (tkr), carried to scanner RAS by the file's own volume geometry"
+    try:
+        formats.read_surface(path, like=Grid.from_spacing((2, 2, 2)))
+    except RefusedError:
+        return "as stored, of a space that the file does not tell: with a volume, --frame is to say which"
+    return "scanner RAS"
+
+
+def describe_overlay(path: Path) -> list[str]:
+    """Lines on format, vertices and values of vertex data, a line for each map; raises as `formats.read_maps`."""
+    maps = formats.read_maps(path)
+    vertices = len(next(iter(maps.values())))
+    several = f"{len(maps)} maps" if len(maps) > 1 else "1 map"
+    lines = [f"{formats.overlay_format(path)} vertex data, {vertices} vertices, {several}"]
+    lines += [f"{name}: {_spread_of(values)}" for name, values in list(maps.items())[:MOST_MAPS]]
+    if len(maps) > MOST_MAPS:
+        lines.append(f"... and {len(maps) - MOST_MAPS} more")
+    return lines
+
+
+def _spread_of(values: np.ndarray) -> str:
+    finite = values[np.isfinite(values)]
+    missing = f"{np.isnan(values).sum()} NaN, {np.isinf(values).sum()} infinite"
+    if not finite.size:
+        return f"no finite value, {missing}"
+    return f"range {finite.min():.6g} to {finite.max():.6g}, median {np.median(finite):.6g}, {missing}"
+
+
 def describe_volume(path: Path) -> list[str]:
     """Lines on format, grid, orientation, values and surface of a volume; raises as `formats.read_volume`.
 
@@ -80,6 +155,7 @@ def describe_volume(path: Path) -> list[str]:
         f"first voxel at RAS {', '.join(f'{x:.4g}' for x in grid.affine[:3, 3])} mm",
         f"values: {finite.size} finite, {int(np.isnan(values).sum())} NaN, {int(np.isinf(values).sum())} infinite",
     ]
+    lines += [f"in doubt: {note.removeprefix(f'{path}: ')}" for note in volume.notes]
     if volume.channels > 1:
         lines.append(f"{volume.channels} channels or frames: for denoise --kind vector")
     if np.iscomplexobj(values):
@@ -96,7 +172,11 @@ def describe_volume(path: Path) -> list[str]:
 
 def _as_levelset(values: np.ndarray, finite: np.ndarray) -> str:
     if mask := two_values(values):
-        return f"a mask of {mask[0]:g} and {mask[1]:g}: its surface would be a staircase"
+        return f"a mask of {mask[0]:g} and {mask[1]:g}: a segmentation, whose surface is made smooth"
+    if is_segmentation(finite):
+        labels = np.unique(finite)
+        some = ", ".join(f"{label:g}" for label in labels[:MOST_LABELS]) + (" ..." if len(labels) > MOST_LABELS else "")
+        return f"{len(labels)} whole numbers ({some}): a segmentation, of which --labels or --between take some"
     try:
         box = crossing_box(values, (0, 0, 0))
     except BeltramiError:

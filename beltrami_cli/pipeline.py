@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,14 @@ from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import own_samples
 from beltrami_cli.grid import Grid, Volume, require_same_grid, with_channels
-from beltrami_cli.inputs import PlaneLast, Warnings, band_of, require_usable, time_step, without
+from beltrami_cli.inputs import PlaneLast, Warnings, band_of, grid_around, require_usable, time_step, without
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.progress import Phases
-from beltrami_cli.record import sidecar
+from beltrami_cli.record import sha256, sidecar
 from beltrami_cli.resample import resample
 from beltrami_cli.sampling import surface_mesh
-from beltrami_cli.solver import Result, Solver
+from beltrami_cli.solver import Gathered, Result, Solver
+from beltrami_cli.sources import read_source
 from beltrami_cli.surface import Mesh
 
 REMEDY = "--resample brings it onto the level set's grid"
@@ -34,62 +34,95 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
     """Denoise files: read, check, denoise, write OUT, mesh and sidecar. Nothing is written unless everything is.
 
     notify: called with each warning as soon as it is known. Raises as `denoise`, and RefusedError, from
-    the headers alone, where an output exists or cannot be written, or the grids differ. Frames that run independently
-    stream through memory one at a time; the result then holds no data.
+    the headers alone, where an output exists or cannot be written, or the grids differ. Frames of volumes that run
+    independently stream through memory one at a time; the result then holds no data.
     """
     phases, warnings = Phases(), Warnings(notify)
-    grid = _check_grids(job)
-    files = _Files(job, curve=1 in grid.shape)
-    plane = _is_plane(job, grid)
-    sources = [file for path in job.all_inputs for file in formats.input_files(path)]
+    with phases("read"):
+        scene = _survey(job)
+    files = _Files(job, scene)
+    sources = [file for path in job.all_inputs for file in _files_of(path)]
     with formats.Stage(files.all, overwrite=job.overwrite, inputs=sources) as stage:
         with phases("numba"):
             kernels.wake()
         with ThreadPoolExecutor(1) as pool:
-            digests = pool.submit(lambda: [_sha256(path) for path in sources])
-            work = _denoise_series if job.settings.independent else _denoise_volume
-            solved, like = work(job, plane, stage, phases, warnings, observer)
+            digests = pool.submit(lambda: [sha256(path) for path in sources])
+            if scene.at_vertices:
+                work = _denoise_vertices
+            else:
+                work = _denoise_series if job.settings.independent else _denoise_volume
+            solved = work(job, scene, stage, phases, warnings, observer)
             hashes = digests.result()
         with phases("write"):
-            if job.filled is not None:
-                formats.write_volume(stage.path(job.filled), like.with_data(solved.filled), dtype=np.uint8)
             for path in files.meshes:
                 assert solved.mesh is not None
-                formats.write_mesh(stage.path(path), solved.mesh)
+                shown = replace(solved.mesh, structure=scene.structure_of(solved.mesh))
+                formats.write_mesh(stage.path(path), files.held_by(path, shown))
+            for (_, path), mesh, values in zip(job.on, scene.on, solved.on, strict=True):
+                formats.write_overlay(stage.path(path), values, structure=scene.structure_of(mesh))
         record = sidecar(job, sources, files.all, hashes, solved.record, tuple(warnings.lines), phases.seconds)
         stage.path(files.sidecar).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         stage.commit()
     return replace(solved, record=record, warnings=tuple(warnings.lines))
 
 
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What a job is about, before any volume is read.
+
+    grid: to compute on. surface: LEVELSET, where it is a mesh. at_vertices: DATA are values at its vertices.
+    on: the meshes that values are to be put on. structure: of what is written, where the job says it.
+    """
+
+    grid: Grid
+    surface: Mesh | None
+    at_vertices: bool
+    on: tuple[Mesh, ...]
+    structure: str | None
+
+    def structure_of(self, mesh: Mesh) -> str | None:
+        return self.structure or mesh.structure
+
+
 def _denoise_volume(
-    job: Job, plane: bool, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
-) -> tuple[Result, Volume]:
-    """The result, its volume written, and a volume of the grid and header that outputs are to have."""
+    job: Job, scene: _Scene, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
+) -> Result:
+    """The result, its volumes written."""
     with phases("read"):
-        psi, trust = _read_levelset(job), _read_trust(job)
-        data = _read(job, job.data, channels=job.settings.kind == "vector", plane=plane)
+        source, trust = _read_levelset(job, scene, warnings), _read_trust(job, warnings)
+        psi = source if isinstance(source, Volume) else None
+        plane = _is_plane(job, scene.grid)
+        data = _read(job, job.data, warnings, channels=job.settings.kind == "vector", plane=plane)
         data = _onto(_that_counts(data, trust, job), psi, job, f"DATA {job.data}", period=job.settings.period)
         if psi is not None and formats.volume_format(job.volume) != formats.volume_format(job.data):
             data = replace(data, header=psi.header)
-    solver = _solver(job, psi, trust, data.grid, phases, warnings)
+    solver = _solver(job, scene, source, trust, psi or data, phases, warnings)
     solved = solver.denoise(data.data, observer)
     with phases("write"):
         formats.write_volume(stage.path(job.volume), data.with_data(solved.data), dtype=job.settings.precision)
-    return solved, data
+        if job.filled is not None:
+            formats.write_volume(stage.path(job.filled), data.with_data(solved.filled), dtype=np.uint8)
+    return solved
 
 
 def _denoise_series(
-    job: Job, plane: bool, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
-) -> tuple[Result, Volume]:
+    job: Job, scene: _Scene, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
+) -> Result:
     """As `_denoise_volume`, frame by frame."""
     with phases("read"):
-        psi, trust = _read_levelset(job), _read_trust(job)
+        source, trust = _read_levelset(job, scene, warnings), _read_trust(job, warnings)
+        psi = source if isinstance(source, Volume) else None
         series = formats.open_series(
-            job.data, spacing=_spacing_for(job.data, job.spacing), dtype=job.settings.precision, plane=plane
+            job.data,
+            spacing=_spacing_for(job.data, job.spacing),
+            dtype=job.settings.precision,
+            plane=_is_plane(job, scene.grid),
         )
+        _pass_on(series, warnings)
     like = series if psi is None else replace(series, grid=psi.grid)
-    solver = _solver(job, psi, trust, like.grid, phases, warnings)
+    # An empty volume in whose place the frames are, for what has to be brought onto their grid.
+    place = psi or Volume(np.empty(like.grid.shape, bool), like.grid)
+    solver = _solver(job, scene, source, trust, place, phases, warnings)
 
     def frame(t: int) -> np.ndarray:
         with phases("read"):
@@ -97,33 +130,66 @@ def _denoise_series(
             return _onto(data, psi, job, f"DATA {job.data}").data
 
     record: dict[str, Any] = {}
-    at_vertices: list[np.ndarray] = []
-    filled = np.zeros(like.grid.shape, bool)
-    meshes: list[Mesh] = []
+    gathered = Gathered()
 
     def denoised() -> Iterator[np.ndarray]:
         for result in solver.denoise_frames(series.count, frame, record, observer):
-            if result.mesh is not None and result.mesh.values is not None:
-                at_vertices.append(result.mesh.values)
-                meshes[:] = [result.mesh]
-            np.logical_or(filled, result.filled, out=filled)
+            gathered.add(result)
             yield result.data
 
     formats.write_series(stage.path(job.volume), like, denoised(), dtype=job.settings.precision)
-    mesh = replace(meshes[0], values=np.stack(at_vertices, -1)) if meshes else None
-    as_stored = with_channels(series.file_shape, series.count, 1) if like.grid.shape == series.grid.shape else ()
-    return Result(np.empty(0), mesh, filled, record, ()), Volume(filled, like.grid, as_stored, like.header)
+    solved = gathered.result(np.empty(0), record)
+    if job.filled is not None:
+        as_stored = with_channels(series.file_shape, series.count, 1) if like.grid.shape == series.grid.shape else ()
+        filled = Volume(solved.filled, like.grid, as_stored, like.header)
+        formats.write_volume(stage.path(job.filled), filled, dtype=np.uint8)
+    return solved
+
+
+def _denoise_vertices(
+    job: Job, scene: _Scene, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
+) -> Result:
+    """The result, its values at vertices written."""
+    assert scene.surface is not None
+    count, dtype, several = len(scene.surface.vertices_ras_mm), job.settings.precision, job.settings.kind == "vector"
+    with phases("read"):
+        data = formats.read_overlay(job.data, count, dtype=dtype, channels=several, map=_map(job.map))
+        weights, mask = (
+            None if path is None else formats.read_overlay(path, count, dtype=dtype) for path in (job.weights, job.mask)
+        )
+    solver = Solver(
+        scene.surface, scene.grid, job.settings, phases, warnings, weights, mask, at_vertices=True, on=scene.on
+    )
+    solved = solver.denoise_series(data) if job.settings.independent else solver.denoise(data, observer)
+    with phases("write"):
+        structure = scene.structure_of(scene.surface)
+        formats.write_overlay(stage.path(job.volume), solved.data, structure=structure, dtype=dtype)
+        if job.filled is not None:
+            formats.write_overlay(stage.path(job.filled), solved.filled.astype(np.float32), structure=structure)
+    return solved
+
+
+def _map(given: str | None) -> str | int | None:
+    return int(given) if given is not None and given.isdecimal() else given
 
 
 def _solver(
-    job: Job, psi: Volume | None, trust: dict[str, Volume], grid: Grid, phases: Phases, warnings: Warnings
+    job: Job,
+    scene: _Scene,
+    source: Volume | Mesh | None,
+    trust: dict[str, Volume],
+    place: Volume,
+    phases: Phases,
+    warnings: Warnings,
 ) -> Solver:
+    """The solver on the grid of `place`, onto which weights and mask are brought."""
     with phases("read"):
-        here = {name: _onto(volume, psi, job, name).data for name, volume in trust.items()}
+        here = {name: _onto(volume, place, job, name).data for name, volume in trust.items()}
         weights, mask = here.get("weights"), here.get("mask")
     if mask is not None:
         mask = np.nan_to_num(mask) >= 0.5  # between voxels, where it was moved
-    return Solver(None if psi is None else psi.data, grid, job.settings, phases, warnings, weights, mask)
+    surface = source.data if isinstance(source, Volume) else source
+    return Solver(surface, place.grid, job.settings, phases, warnings, weights, mask, on=scene.on)
 
 
 def mesh_of(
@@ -164,40 +230,126 @@ def mesh_of(
 class _Files:
     """Every file that a job writes, the sidecar last."""
 
-    def __init__(self, job: Job, curve: bool) -> None:
+    def __init__(self, job: Job, scene: _Scene) -> None:
+        curve = 1 in scene.grid.shape
         meshes = job.mesh
         if meshes is None:
-            meshes = () if job.settings.flat else (formats.mesh_beside(job.volume, curve=curve),)
+            beside = formats.mesh_beside(job.volume, curve=curve)
+            meshes = () if job.settings.flat else (beside,)
         self.meshes = meshes
-        written = [file for mesh in meshes for file in formats.mesh_files(mesh, curve=curve)]
-        filled = [] if job.filled is None else formats.volume_files(job.filled)
+        # OUT holds the values of a .surf.gii beside it already.
+        self.bare = {
+            mesh for mesh in meshes if scene.at_vertices and (job.mesh is None or _values_are(job.volume, mesh))
+        }
+        written = [
+            file for mesh in meshes for file in formats.mesh_files(mesh, values=mesh not in self.bare, curve=curve)
+        ]
+        files_of = formats.overlay_files if scene.at_vertices else formats.volume_files
+        filled = [] if job.filled is None else files_of(job.filled)
+        on = [file for _, path in job.on for file in formats.overlay_files(path)]
         stem = formats.stem(job.volume)
         self.sidecar = stem.with_name(stem.name + ".json")
-        self.all = [*formats.volume_files(job.volume), *filled, *written, self.sidecar]
+        self.all = [*files_of(job.volume), *filled, *written, *on, self.sidecar]
+
+    def held_by(self, path: Path, mesh: Mesh) -> Mesh:
+        """The mesh as its file is to hold it."""
+        return replace(mesh, values=None) if path in self.bare else mesh
 
 
-def _check_grids(job: Job) -> Grid:
+def _values_are(out: Path, mesh: Path) -> bool:
+    """True where `out` is the file that a mesh's values are written to."""
+    return out in formats.mesh_files(mesh)
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Every file that is read for an input."""
+    return [path] if formats.is_surface(path) or formats.is_overlay(path) else formats.input_files(path)
+
+
+def _survey(job: Job) -> _Scene:
+    """What the job is about, from headers and surfaces; raises RefusedError where files will not do."""
+    structure = None if job.structure is None else formats.parse_structure(job.structure)
+    surface, at_vertices = None, False
+    if job.levelset is not None and formats.is_surface(job.levelset):
+        at_vertices = formats.is_overlay(job.data)
+        like = None if at_vertices else _grid_of(job, job.data, channels=job.settings.kind == "vector")
+        surface = formats.read_surface(job.levelset, frame=job.frame, like=like)
+        _require_sense(job, at_vertices)
+    elif formats.is_overlay(job.data):
+        raise RefusedError(
+            f"DATA {job.data}: values at the vertices of a surface; found LEVELSET {job.levelset}, which is none: give "
+            "the surface as LEVELSET, or DATA as a volume"
+        )
+    if at_vertices:
+        assert surface is not None
+        spacing = None if job.spacing is None else job.spacing[0]
+        grid = grid_around(surface, job.settings, spacing)
+        for path in (job.volume, *([] if job.filled is None else [job.filled])):
+            formats.overlay_files(path)
+    else:
+        grid = _check_grids(job, surface)
+    job.settings.duration(time_step(grid, job.settings))
+    if not job.settings.flat:
+        job.settings.half_width(grid.used_spacing)
+    like = None if at_vertices else grid
+    on = tuple(formats.read_surface(path, frame=job.frame, like=like) for path, _ in job.on)
+    return _Scene(grid, surface, at_vertices, on, structure)
+
+
+def _require_sense(job: Job, at_vertices: bool) -> None:
+    """Raise RefusedError for what a surface as LEVELSET, or data at its vertices, leave no room for."""
+    settings = job.settings
+    if job.labels or job.between:
+        raise RefusedError(
+            f"labels, between: are for a segmentation; found LEVELSET {job.levelset}, a surface; drop them"
+        )
+    if settings.inside == "positive":
+        raise RefusedError("inside: is for a level set; a surface's triangles say where outside is; drop it")
+    if not at_vertices:
+        if job.map is not None:
+            raise RefusedError(f"map: is for values at vertices; found DATA {job.data}, a volume; drop --map")
+        return
+    if settings.depth is not None:
+        raise RefusedError(
+            "depth: averages a volume along the normal; found DATA at the vertices of a surface; drop it"
+        )
+    if settings.extension != "closest-point":
+        raise RefusedError(
+            f"extension: found {settings.extension}, which is for volumes; DATA at vertices need closest-point; drop it"
+        )
+    if settings.outside != "nan":
+        raise RefusedError("outside: is for volumes; found DATA at the vertices of a surface; drop it")
+    if job.resample:
+        raise RefusedError("resample: is for volumes; found DATA at the vertices of a surface; drop it")
+    if job.spacing is not None and len(job.spacing) > 1:
+        raise RefusedError(f"spacing: found {job.spacing}; expected one number: the band around a surface has cubes")
+
+
+def _check_grids(job: Job, surface: Mesh | None) -> Grid:
     """The grid to compute on, from headers alone; raises RefusedError where it or the outputs' formats will not do."""
-    if job.spacing is not None and not any(formats.volume_format(path) == "NPY" for path in job.all_inputs):
+    if job.spacing is not None and not any(_is_npy(path) for path in job.all_inputs):
         raise RefusedError("spacing: is for .npy inputs only; found none among LEVELSET and DATA; drop --spacing")
     several = job.settings.kind == "vector"
     grids: dict[str, tuple[Path, Grid]] = {}
+    # A surface has no grid, and that of a segmentation need not be that of the data.
+    own_grid = surface is None and not (job.labels or job.between)
+    levelset = job.levelset if own_grid else None
     for name, path in zip(
-        ("LEVELSET", "DATA", "weights", "mask"), (job.levelset, job.data, job.weights, job.mask), strict=True
+        ("LEVELSET", "DATA", "weights", "mask"), (levelset, job.data, job.weights, job.mask), strict=True
     ):
         if path is not None:
             channels = several and name == "DATA"
             plane = channels and _is_plane(job, grids["LEVELSET"][1] if "LEVELSET" in grids else None)
-            steps = _spacing_for(path, job.spacing)
-            grids[name] = path, formats.read_grid(path, spacing=steps, channels=channels, plane=plane)
+            grids[name] = path, _grid_of(job, path, channels=channels, plane=plane)
     first, (where, grid) = next(iter(grids.items()))
     for name, (path, other) in grids.items():
         if not job.resample:
             require_same_grid(grid, f"{first} {where}", other, f"{name} {path}", remedy=REMEDY)
     require_usable(grid, str(where))
-    job.settings.duration(time_step(grid, job.settings))
-    if not job.settings.flat:
-        job.settings.half_width(grid.used_spacing)
+    if not own_grid and 1 in grid.shape and job.levelset is not None:
+        raise RefusedError(
+            f"DATA {where}: found a plane; expected a volume around the surface of LEVELSET {job.levelset}"
+        )
     layout = formats.read_layout(job.data, plane=_is_plane(job, grid)) if several else (1, False)
     formats.require_writable(job.volume, grid, channels=layout[0], is_complex=layout[1])
     if job.filled is not None:
@@ -205,31 +357,64 @@ def _check_grids(job: Job) -> Grid:
     return grid
 
 
+def _grid_of(job: Job, path: Path, *, channels: bool = False, plane: bool = False) -> Grid:
+    return formats.read_grid(path, spacing=_spacing_for(path, job.spacing), channels=channels, plane=plane)
+
+
 def _is_plane(job: Job, grid: Grid | None) -> bool:
     """True where DATA of three axes are a plane of channels: its level set, on `grid`, is one, or it is a picture."""
     return job.levelset is None or (grid is not None and 1 in grid.shape)
 
 
+def _is_npy(path: Path) -> bool:
+    return path.suffix.lower() == ".npy"
+
+
 def _spacing_for(path: Path, spacing: tuple[float, ...] | None) -> tuple[float, ...] | None:
-    return spacing if formats.volume_format(path) == "NPY" else None
+    return spacing if _is_npy(path) else None
 
 
-def _read(job: Job, path: Path, *, channels: bool = False, plane: bool = False) -> Volume:
+def _read(job: Job, path: Path, warnings: Warnings, *, channels: bool = False, plane: bool = False) -> Volume:
     steps = _spacing_for(path, job.spacing)
-    return formats.read_volume(path, spacing=steps, dtype=job.settings.precision, channels=channels, plane=plane)
+    volume = formats.read_volume(path, spacing=steps, dtype=job.settings.precision, channels=channels, plane=plane)
+    _pass_on(volume, warnings)
+    return volume
 
 
-def _read_levelset(job: Job) -> Volume | None:
-    return None if job.levelset is None else _read(job, job.levelset)
+def _pass_on(source: Volume | formats.Series, warnings: Warnings) -> None:
+    """What a reader had to say of its file."""
+    for line in source.notes:
+        if line not in warnings.lines:
+            warnings.add(line)
 
 
-def _read_trust(job: Job) -> dict[str, Volume]:
+def _read_levelset(job: Job, scene: _Scene, warnings: Warnings) -> Volume | Mesh | None:
+    if job.levelset is None or scene.surface is not None:
+        return scene.surface
+    if 1 in scene.grid.shape:
+        return _read(job, job.levelset, warnings)
+    source = read_source(
+        job.levelset,
+        labels=job.labels,
+        between=job.between,
+        spacing=_spacing_for(job.levelset, job.spacing),
+        dtype=job.settings.precision,
+        notify=warnings.add,
+    )
+    if isinstance(source, Volume):
+        _pass_on(source, warnings)
+    elif job.settings.inside == "positive":
+        raise RefusedError(f"inside: is for a level set; found LEVELSET {job.levelset}, a segmentation; drop it")
+    return source
+
+
+def _read_trust(job: Job, warnings: Warnings) -> dict[str, Volume]:
     """What says how much data count: "weights" as they are, "mask" as 1 where it is not 0; those there are."""
     trust = {}
     if job.weights is not None:
-        trust["weights"] = _read(job, job.weights)
+        trust["weights"] = _read(job, job.weights, warnings)
     if job.mask is not None:
-        mask = _read(job, job.mask)
+        mask = _read(job, job.mask, warnings)
         trust["mask"] = mask.with_data((np.nan_to_num(mask.data) != 0).astype(mask.data.dtype))
     return trust
 
@@ -245,21 +430,16 @@ def _that_counts(data: Volume, trust: dict[str, Volume], job: Job) -> Volume:
     return replace(data, data=values)
 
 
-def _onto(volume: Volume, psi: Volume | None, job: Job, name: str, *, period: float | None = None) -> Volume:
-    """The volume on the level set's grid; missing values are not mixed with others on the way."""
-    if psi is None or not job.resample or volume.grid.matches(psi.grid):
+def _onto(volume: Volume, place: Volume | None, job: Job, name: str, *, period: float | None = None) -> Volume:
+    """The volume on the grid of another; missing values are not mixed with others on the way."""
+    if place is None or not job.resample or volume.grid.matches(place.grid):
         return volume
-    moved = resample(volume, psi.grid, period=period)
+    moved = resample(volume, place.grid, period=period)
     if not np.isfinite(moved.data).any():
         raise DataError(
             f"{name}: has no value on the grid of {job.levelset}: found no overlap in world space, "
             "expected volumes of one head in one space"
         )
     if moved.channels > 1:  # what the header says of frames goes with them
-        return Volume(moved.data, psi.grid, (), volume.header)
-    return Volume(moved.data, psi.grid, psi.file_shape, psi.header)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return Volume(moved.data, place.grid, (), volume.header)
+    return Volume(moved.data, place.grid, place.file_shape, place.header)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import sys
@@ -23,6 +24,9 @@ from beltrami_cli.kinds import Kind
 from beltrami_cli.observed import Observed
 from beltrami_cli.planning import Plan
 from beltrami_cli.tuning import Choice
+
+# Parameters that say how files are read and written, not how values are denoised.
+OF_FILES = ("resample", "spacing", "labels", "between", "map", "frame", "structure")
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +167,7 @@ def sidecar(
         "Outputs": [os.fspath(file) for file in files],
         "Created": datetime.now(UTC).isoformat(timespec="seconds"),
         **happened,
-        "Parameters": {**happened["Parameters"], "resample": job.resample, "spacing": job.spacing},
+        "Parameters": {**happened["Parameters"], **{name: getattr(job, name) for name in OF_FILES}},
         "Warnings": list(warnings),
         "Seconds": {name: round(spent, 3) for name, spent in seconds.items()},
         "PeakMemoryMiB": _peak_memory_mib(),
@@ -172,8 +176,15 @@ def sidecar(
 
 def _role(job: Job, path: Path) -> dict[str, str]:
     """What a source was to the run; nothing for the second file of a pair."""
-    roles = {"levelset": job.levelset, "data": job.data, "weights": job.weights, "mask": job.mask}
-    return next(({"Role": role} for role, file in roles.items() if file == path), {})
+    roles = [("levelset", job.levelset), ("data", job.data), ("weights", job.weights), ("mask", job.mask)]
+    roles += [("on", surface) for surface, _ in job.on]
+    return next(({"Role": role} for role, file in roles if file == path), {})
+
+
+def sha256(path: Path) -> str:
+    """The hexadecimal digest of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _peak_memory_mib() -> float | None:

@@ -63,6 +63,26 @@ class Result:
     on: tuple[np.ndarray, ...] = ()
 
 
+class Gathered:
+    """Results of frames, one after another, as one: frames on a last axis; filled is what was filled in any."""
+
+    def __init__(self) -> None:
+        self.mesh: Mesh | None = None
+        self.shown: list[list[np.ndarray]] = []
+        self.filled = np.zeros((), bool)
+
+    def add(self, result: Result) -> None:
+        self.mesh = result.mesh
+        at_mesh = [] if result.mesh is None or result.mesh.values is None else [result.mesh.values]
+        self.shown.append([*at_mesh, *result.on])
+        self.filled = self.filled | result.filled
+
+    def result(self, data: np.ndarray, record: dict[str, Any]) -> Result:
+        values = [np.stack(frames, -1) for frames in zip(*self.shown, strict=True)]
+        mesh = None if self.mesh is None else replace(self.mesh, values=values.pop(0))
+        return Result(data, mesh, self.filled, record, (), tuple(values))
+
+
 class Solver:
     """The band, the weights and the settings that all frames of a run share.
 
@@ -135,9 +155,18 @@ class Solver:
         return points
 
     def denoise(self, data: np.ndarray, observer: Observer | None = None) -> Result:
-        """Denoise data of shape grid.shape, or grid.shape + (K,) for a vector."""
+        """Denoise data of shape grid.shape or (V,), or with (K,) behind for a vector."""
         sample = self._sample(data, self.warnings)
         return self._run(data, sample, self.planner.plan(sample), self.warnings, observer)
+
+    def denoise_series(self, data: np.ndarray) -> Result:
+        """Denoise every frame of data, one channel's shape + (K,), on its own."""
+        record: dict[str, Any] = {}
+        gathered, frames = Gathered(), []
+        for result in self.denoise_frames(data.shape[-1], lambda t: data[..., t], record):
+            gathered.add(result)
+            frames.append(result.data)
+        return gathered.result(np.stack(frames, -1), record)
 
     def denoise_frames(
         self,
@@ -148,7 +177,7 @@ class Solver:
     ) -> Iterator[Result]:
         """Denoise `count` frames one after another, all with what is chosen on the middle one (that holds data).
 
-        frame: its number -> data of shape grid.shape. record: is given the middle one's record, with lists over all.
+        frame: its number -> data of one channel's shape. record: is given the middle one's, with lists over all.
         """
         chosen_on, sample = self._first_sample(count, frame)
         plan = self.planner.plan(sample)

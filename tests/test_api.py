@@ -187,7 +187,7 @@ def test_threads_stay_the_callers_own():
 
 
 def test_package_names():
-    assert set(beltrami_cli.__all__) == {"Result", "__version__", "denoise"}
+    assert set(beltrami_cli.__all__) == {"Mesh", "Result", "__version__", "denoise"}
     with pytest.raises(AttributeError, match="no attribute 'smooth'"):
         beltrami_cli.smooth  # noqa: B018
 

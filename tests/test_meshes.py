@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -39,6 +40,16 @@ def test_gifti(tmp_path):
     assert np.array_equal(values.darrays[0].data, VALUES, equal_nan=True)
     assert values.darrays[0].data.dtype == np.float32
     assert values.darrays[0].meta["Name"] == "value"
+
+
+def test_gifti_names_the_structure(tmp_path):
+    written = write_mesh(tmp_path / "o.surf.gii", replace(SURFACE, structure="CortexRight"))
+    surface, values = (nib.load(path) for path in written)
+    assert surface.meta["AnatomicalStructurePrimary"] == values.meta["AnatomicalStructurePrimary"] == "CortexRight"
+    about = dict(surface.darrays[0].meta)
+    assert about == {"AnatomicalStructurePrimary": "CortexRight", "GeometricType": "Anatomical"}
+    surface, values = (nib.load(path) for path in write_mesh(tmp_path / "o.surf.gii", SURFACE))
+    assert (dict(surface.meta), dict(values.meta)) == ({}, {})
 
 
 def test_gifti_without_values_is_one_file(tmp_path):

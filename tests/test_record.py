@@ -13,6 +13,7 @@ import pytest
 from command import ball, done, load, nifti, noisy, record, seen
 
 import beltrami_cli
+from beltrami_cli.record import OF_FILES
 
 PARAMETERS = {
     "flow", "phi", "beta", "edge", "eps", "scheme", "flat", "fidelity", "dt", "iterations", "time", "fwhm", "stop",
@@ -39,7 +40,7 @@ def test_parameters_as_used(scene, tmp_path):
     done("denoise", levelset, data, "-o", out)
     written = record(tmp_path / "out.json")
     used = written["Parameters"]
-    assert set(used) == PARAMETERS | {"resample", "spacing"}
+    assert set(used) == PARAMETERS | set(OF_FILES)
     assert used["beta"] == written["PerIteration"]["beta"][0]
     expected = {
         "flow": "beltrami", "phi": None, "eps": None, "scheme": "symmetric", "flat": False, "dt": 0.15,

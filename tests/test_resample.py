@@ -7,7 +7,7 @@ import pytest
 from twins import TWINS, volume, voxels
 
 from beltrami_cli.grid import Grid, Volume
-from beltrami_cli.resample import resample
+from beltrami_cli.resample import at_points, resample
 
 
 def linear(ras_mm):
@@ -105,3 +105,71 @@ def test_missing_angles_take_no_part():
     grid = Grid.from_spacing(angles.shape)
     moved = resample(Volume(angles, grid), grid, period=360.0).data
     assert np.allclose(moved, angles, equal_nan=True)
+
+
+# --- at points -----------------------------------------------------------------------------------------------------
+
+
+def scattered(grid, count=500, beyond=0.0, seed=0):
+    """Points (count, 3) in RAS mm, within the outermost voxel centres and so many voxels beyond them."""
+    share = np.random.default_rng(seed).random((count, 3))
+    return grid.to_world(-beyond + share * (np.array(grid.shape) - 1 + 2 * beyond))
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_linear_fields_are_exact_at_points(name):
+    points = scattered(TWINS[name])
+    got = at_points(linear_volume(TWINS[name]), points)
+    assert got.shape == (500,)
+    assert np.abs(got - linear(points)).max() < 1e-9
+    assert at_points(volume(TWINS[name]), points).dtype == np.float32
+
+
+def test_points_have_the_values_of_a_grid_through_them():
+    source, target = TWINS["PSR"], TWINS["oblique"]
+    data = np.random.default_rng(1).normal(size=(*source.shape, 2))
+    data[np.random.default_rng(2).random(data.shape) < 0.3] = np.nan
+    given = Volume(data, source)
+    got = at_points(given, target.to_world(voxels(target))).reshape(*target.shape, 2)
+    assert np.allclose(got, resample(given, target).data, atol=1e-9, equal_nan=True)
+    assert 0.1 < np.isnan(got).mean() < 0.9
+
+
+def test_points_outside_have_no_value():
+    grid = TWINS["oblique left-handed"]
+    points = scattered(grid, 2000, beyond=2.0)
+    index = grid.to_index(points)
+    past = np.maximum(-index, index - (np.array(grid.shape) - 1)).max(1)
+    got = at_points(linear_volume(grid), points)
+    assert np.isnan(got[past > 0.5]).all() and np.isfinite(got[past <= 0]).all()
+    assert np.isnan(at_points(linear_volume(grid), points + 1e4)).all()
+
+
+def test_midway_to_a_missing_voxel_has_its_value():
+    """By the rule, not by how the weights were rounded: from either side, in either precision."""
+    for dtype in (np.float32, np.float64):
+        data = np.array([[[np.nan, 5.0, 5.0, np.nan]]], dtype).repeat(2, 0).repeat(2, 1)
+        affine = np.diag([0.7, 0.7, 0.7, 1.0])
+        affine[:3, 3] = 17.3
+        points = Grid(data.shape, affine).to_world(np.array([[0.3, 0.7, 0.5], [0.3, 0.7, 2.5], [0.3, 0.7, 0.49]]))
+        assert np.allclose(at_points(Volume(data, Grid(data.shape, affine)), points), [5, 5, np.nan], equal_nan=True)
+
+
+def test_angles_at_points_turn_through_the_wrap():
+    angles = np.array([350.0, 20.0, np.nan, 90.0]).reshape(4, 1, 1)
+    given = Volume(angles, Grid(angles.shape, np.eye(4)))
+    at = np.array([[0.5, 0, 0], [0, 0, 0], [1.4, 0, 0], [2, 0, 0], [2.6, 0, 0]])
+    got = at_points(given, at, period=360.0)
+    assert np.allclose(got, [5, 350, 20, np.nan, 90], equal_nan=True)
+    signed = given.with_data(np.where(angles > 180, angles - 360, angles))
+    assert np.allclose(at_points(signed, at, period=360.0)[:2], [5, -10])
+
+
+def test_channels_and_complex_numbers_at_points():
+    source = linear_volume(TWINS["LAS"])
+    points = scattered(source.grid)
+    one, other = linear(points), at_points(source.with_data(source.data**2), points)
+    several = at_points(Volume(np.stack([source.data, source.data**2], -1), source.grid), points)
+    assert np.allclose(several, np.stack([one, other], -1), rtol=1e-12)
+    waves = at_points(source.with_data(source.data + 1j * source.data**2), points)
+    assert np.allclose(waves, one + 1j * other, rtol=1e-12)

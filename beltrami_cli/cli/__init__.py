@@ -14,8 +14,10 @@ from beltrami_cli.cli.compare import compare
 from beltrami_cli.cli.demo import demo
 from beltrami_cli.cli.denoise import denoise
 from beltrami_cli.cli.info import info
+from beltrami_cli.cli.levelset import levelset
 from beltrami_cli.cli.mesh import mesh
 from beltrami_cli.cli.phantom import phantom
+from beltrami_cli.cli.sample import sample
 
 EPILOG = """Exit codes: 0 done; 1 the data or the numerics failed, or a comparison is out of tolerance; 2 usage, or
 refused before starting; 130 on Ctrl-C; 143 on SIGTERM.
@@ -29,7 +31,7 @@ def beltrami() -> None:
     """Denoise data that lie on a surface given as the zero level of a volume, above all maps on the folded cortex."""
 
 
-for command in (denoise, mesh, phantom, compare, info, demo):
+for command in (denoise, levelset, mesh, sample, phantom, compare, info, demo):
     beltrami.add_command(command)
 
 

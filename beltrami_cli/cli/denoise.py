@@ -54,7 +54,28 @@ class Denoise(Command):
 @click.option("--filled", type=FILE, help="A mask of the voxels that had no value and got one.")
 @click.option("--weights", type=FILE, help="How much each voxel of DATA counts: R^2, coherence ...; 0 or more.")
 @click.option("--mask", type=FILE, help="Which voxels of DATA count: those where it is not 0. All else is missing.")
-@click.option("--spacing", metavar="S|SX,SY,SZ", help="Voxel size in mm of .npy inputs. Default: 1.")
+@click.option(
+    "--on",
+    multiple=True,
+    metavar="SURFACE=FILE",
+    help="Values at the vertices of your own surface, in their order, as .func.gii .shape.gii .mgz or lh.NAME; may be "
+    "repeated.",
+)
+@click.option("--labels", metavar="L1,L2..", help="LEVELSET is a segmentation: these labels are inside.")
+@click.option("--between", metavar="INNER,OUTER", help="The same, and the surface runs midway between the two labels.")
+@click.option("--map", metavar="NAME|N", help="Which map of DATA at vertices, where the file has several.")
+@click.option(
+    "--frame",
+    type=click.Choice(["scanner", "tkr"]),
+    help="What the coordinates of surfaces are: scanner RAS, or FreeSurfer's surface RAS. Default: what the file says.",
+)
+@click.option("--structure", metavar="NAME", help="Of what is written, as CortexLeft. Default: what SURFACE says.")
+@click.option(
+    "--spacing",
+    metavar="S|SX,SY,SZ",
+    help="Voxel size in mm of .npy inputs (default: 1), or of the band around a surface with DATA at its vertices "
+    "(default: its median edge).",
+)
 @click.option(
     "--resample", is_flag=True, default=None, help="Bring DATA, weights and mask onto LEVELSET's grid (trilinear)."
 )
@@ -159,8 +180,13 @@ def denoise(inputs: tuple[Path, ...], config: Path | None, quiet: bool, verbose:
     inside; NaN in DATA is missing and gets filled. Writes OUT, a mesh with the denoised value at every vertex, and a
     JSON record beside OUT.
 
+    LEVELSET may as well be a segmentation (a mask, or labels with --labels or --between) or a surface (.surf.gii .ply
+    .obj .stl, FreeSurfer's lh.white); DATA then may have another grid or, on a surface, be values at its vertices
+    (.func.gii .shape.gii .mgz, FreeSurfer's lh.thickness), and OUT such a file.
+
     \b
         beltrami denoise psi.nii.gz map.nii.gz -o denoised.nii.gz
+        beltrami denoise lh.white lh.thickness -o lh.thickness_denoised
     """
     from beltrami_cli.config import make_job, overlaid, read_config
     from beltrami_cli.pipeline import run
@@ -224,7 +250,7 @@ def _combination(row: dict[str, Any]) -> str:
 
 def _given(inputs: tuple[Path, ...], options: dict[str, Any]) -> dict[str, Any]:
     """The fields that the command line sets."""
-    from beltrami_cli.config import parse_spacing
+    from beltrami_cli.config import parse_on, parse_spacing
 
     if len(inputs) > 2:
         extra = " ".join(map(str, inputs[2:]))
@@ -235,6 +261,8 @@ def _given(inputs: tuple[Path, ...], options: dict[str, Any]) -> dict[str, Any]:
         if "mesh" in given:
             raise click.UsageError("--mesh and --no-mesh contradict each other; give one of them")
         given["mesh"] = ()
+    if "on" in given:
+        given["on"] = tuple(map(parse_on, given["on"]))
     if "spacing" in given:
         given["spacing"] = parse_spacing(given["spacing"])
     if "dt" in given:

@@ -1,4 +1,4 @@
-"""The one door to files: volumes in, volumes and meshes out, each format by its suffix.
+"""The one door to files: volumes, surfaces and vertex data, each format by its suffix or its content.
 
 The only place that knows RAS from LPS, units from millimetres and one header from another.
 """
@@ -13,28 +13,50 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from beltrami_cli.errors import RefusedError
-from beltrami_cli.formats import checks, gifti, metaimage, mgh, nifti, npy, plain_mesh, png
+from beltrami_cli.formats import checks, freesurfer, gifti, metaimage, mgh, nifti, npy, plain_mesh, png
+from beltrami_cli.formats.overlays import (
+    is_overlay,
+    overlay_files,
+    overlay_format,
+    read_maps,
+    read_overlay,
+    write_overlay,
+)
 from beltrami_cli.formats.series import Series, counted
 from beltrami_cli.formats.staging import Stage
+from beltrami_cli.formats.structures import STRUCTURES, parse_structure, structure_of_name
+from beltrami_cli.formats.surfaces import is_surface, read_surface, surface_format
 from beltrami_cli.grid import Grid, Volume
 from beltrami_cli.surface import Mesh
 
 __all__ = [
+    "STRUCTURES",
     "Series",
     "Stage",
     "input_files",
+    "is_overlay",
+    "is_surface",
     "mesh_beside",
     "mesh_files",
     "mesh_format",
     "open_series",
+    "overlay_files",
+    "overlay_format",
+    "parse_structure",
     "read_grid",
     "read_layout",
+    "read_maps",
+    "read_overlay",
+    "read_surface",
     "read_volume",
     "require_writable",
     "stem",
+    "structure_of_name",
+    "surface_format",
     "volume_files",
     "volume_format",
     "write_mesh",
+    "write_overlay",
     "write_series",
     "write_volume",
 ]
@@ -66,8 +88,10 @@ def mesh_format(path: Path) -> str:
 
 
 def stem(path: Path) -> Path:
-    """The path without its format suffix: o.nii.gz -> o, o.func.gii -> o.func, o.surf.gii -> o.surf."""
+    """The path without its format suffix: o.nii.gz -> o, o.func.gii -> o.func, lh.map (FreeSurfer's) -> lh.map."""
     path = Path(path)
+    if freesurfer.is_name(path) and path.name[:3].lower() in ("lh.", "rh."):
+        return path
     suffix = ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix
     return path.with_name(path.name[: len(path.name) - len(suffix)])
 
@@ -217,9 +241,15 @@ def write_series(path: Path, series: Series, frames: Iterable[np.ndarray], *, dt
 
 
 def mesh_beside(path: Path, *, curve: bool = False) -> Path:
-    """The mesh that goes with a volume where none is named: .surf.gii for NIfTI and MGH, .ply else and for a curve."""
-    neuroimaging = volume_format(path) in ("NIfTI", "MGH")
-    return stem(path).with_name(stem(path).name + (".surf.gii" if neuroimaging and not curve else ".ply"))
+    """The mesh that goes with an output where none is named: .ply for MetaImage, NPY and a curve, .surf.gii else.
+
+    For vertex data too: o.func.gii -> o.surf.gii, lh.map -> lh.map.surf.gii.
+    """
+    base = stem(path)
+    if base.suffix in (".func", ".shape"):
+        base = base.with_suffix("")
+    plain = curve or Path(path).suffix.lower() in (".mha", ".mhd", ".npy")
+    return base.with_name(base.name + (".ply" if plain else ".surf.gii"))
 
 
 def mesh_files(path: Path, *, values: bool = True, curve: bool = False) -> list[Path]:

@@ -1,4 +1,4 @@
-"""What every volume format has to refuse, and the guard that turns a library's failure into one line."""
+"""What every format has to refuse, and the guard that turns a library's failure into one line."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def require_file(path: Path) -> None:
     if not path.exists():
         raise RefusedError(f"{path}: no such file; check the path")
     if not path.is_file():
-        raise RefusedError(f"{path}: not a file; expected a volume, not a folder or a device")
+        raise RefusedError(f"{path}: not a file; expected a volume or a surface, not a folder or a device")
     try:
         path.open("rb").close()
     except OSError as error:
@@ -89,16 +89,25 @@ def layout(
             "denoise, give --kind vector (all together; with --independent one after another)"
         )
     nx, ny, nz = (*axes, 1)[:3]
-    on_mesh = nx * ny * nz in _SURFACE_SIZES
-    # Long rows of vertices are also stored folded (fsaverage as 27307 x 1 x 6).
-    folded = on_mesh and len(axes) > 2 and 1 in (nx, ny, nz)
-    if sorted((nx, ny, nz))[1] == 1 or folded:
+    if is_row(axes):
+        on_mesh = nx * ny * nz in _SURFACE_SIZES
         guess = f", {nx * ny * nz} values as on a cortical mesh" if on_mesh else ""
         raise RefusedError(
             f"{path}: expected a volume or a plane; found {found}{guess}: data of a surface or a time course, "
-            "not of voxels; give the volume instead"
+            "not of voxels; give the volume instead, or, with data of a surface, that surface in the level set's place"
         )
     return (nx, ny, nz), (several or [1])[0]
+
+
+def is_row(axes: tuple[int, ...], vertices: int | None = None) -> bool:
+    """True where the first three axes of an array hold values of a surface or a time course: a row, or a folded one.
+
+    Long rows of vertices are also stored folded (fsaverage as 27307 x 1 x 6): known by the number of values, which is
+    that of a usual cortical mesh or `vertices`.
+    """
+    nx, ny, nz = (*axes, 1, 1)[:3]
+    folded = nx * ny * nz in (*_SURFACE_SIZES, vertices) and len(axes) > 2 and 1 in (nx, ny, nz)
+    return sorted((nx, ny, nz))[1] == 1 or folded
 
 
 def _several(axes: tuple[int, ...], per_voxel: int) -> str:

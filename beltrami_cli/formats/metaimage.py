@@ -81,10 +81,9 @@ def write(path: Path, volume: Volume, dtype: DTypeLike) -> None:
     require_writable(path, volume.grid, is_complex=np.iscomplexobj(volume.data))
     header = volume.header if isinstance(volume.header, MetaHeader) else MetaHeader({})
     vectors = volume.channels > 1 and header.frame_step is None
-    shape = volume.file_shape
+    shape = _axes_to_write(volume) if vectors or volume.channels == 1 else volume.grid.shape
     if volume.channels > 1:
-        spatial = with_channels(shape, volume.channels, 1) if vectors else volume.grid.shape
-        shape = (*spatial, volume.channels)
+        shape = (*shape, volume.channels)
     data = np.asarray(volume.data, dtype).reshape(shape)
     array = np.moveaxis(data, -1, 0).T if vectors else data.T
     with checks.writing(path), checks.native_stderr_muted():
@@ -98,6 +97,13 @@ def write(path: Path, volume: Volume, dtype: DTypeLike) -> None:
         for key, value in header.entries.items():
             image.SetMetaData(key, value)
         sitk.WriteImage(image, os.fspath(path), useCompression=path.suffix == ".mha")
+
+
+def _axes_to_write(volume: Volume) -> tuple[int, ...]:
+    """The shape without channels: of a plane two axes, unless it lies elsewhere than at z = 0, which only three say."""
+    axes = with_channels(volume.file_shape, volume.channels, 1)
+    at_zero = np.allclose(volume.grid.affine[2, [0, 1, 3]], 0)
+    return axes if len(axes) > 2 or at_zero else volume.grid.shape
 
 
 def _open(path: Path) -> Any:

@@ -18,6 +18,11 @@ from beltrami_cli.grid import Grid, Volume
 
 _SCANNER = 1  # NIFTI_XFORM_SCANNER_ANAT
 _MM_PER_UNIT = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}
+_SPACES = {1: "scanner", 2: "aligned with another scan", 3: "Talairach", 4: "MNI", 5: "other template"}
+
+# sform and qform place the voxels alike up to this share of a voxel edge: a quaternion of float32, close to half a
+# turn, does not hold them better.
+_FORMS_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,7 @@ def read(path: Path, dtype: DTypeLike, *, channels: bool = False) -> Volume:
         if _is_coloured(image):
             data = np.stack([data[name] for name in "RGB"], -1).astype(dtype)
     shape = (*template.grid.shape, count) if count > 1 else template.grid.shape
-    return Volume(data.reshape(shape, order="A"), template.grid, file_shape, template)
+    return Volume(data.reshape(shape, order="A"), template.grid, file_shape, template, _notes(path, template))
 
 
 def open_series(path: Path, dtype: DTypeLike, *, channels: bool = True) -> Series:
@@ -59,7 +64,7 @@ def open_series(path: Path, dtype: DTypeLike, *, channels: bool = True) -> Serie
         frame = frames_of(lambda: read(path, dtype, channels=True))
     else:
         frame = frames_behind(path, "NIfTI", image.dataobj, template.grid.shape, count, dtype)
-    return Series(template.grid, count, file_shape, template, frame, dtype.kind == "c")
+    return Series(template.grid, count, file_shape, template, frame, dtype.kind == "c", _notes(path, template))
 
 
 def files(path: Path) -> list[Path]:
@@ -142,6 +147,37 @@ def _open(path: Path, channels: bool) -> tuple[Any, NiftiHeader, int, tuple[int,
     affine[:3] *= _MM_PER_UNIT[_units(image.header)[0]]
     checks.require_usable_affine(path, affine)
     return image, NiftiHeader(image.header, Grid(shape, affine)), count, file_shape
+
+
+def _notes(path: Path, template: NiftiHeader) -> tuple[str, ...]:
+    """What the header leaves in doubt about where the voxels lie: its two transforms disagree, or both are unset."""
+    from nibabel.spatialimages import HeaderDataError
+
+    header = template.header
+    sform, qform = int(header["sform_code"]), int(header["qform_code"])
+    if sform == qform == 0:
+        return (
+            f"{path}: sform and qform are both unset, so that left, right and position are unknown: taken as axes "
+            "towards LAS with the origin in the middle, as nibabel does",
+        )
+    if sform == 0 or qform == 0:
+        return ()
+    try:
+        affine = np.array(header.get_qform(), float)
+    except (HeaderDataError, ValueError):  # no rotation; the sform says enough
+        return ()
+    affine[:3] *= template.mm_per_unit
+    apart = template.grid.apart(Grid(template.grid.shape, affine))
+    if not apart > _FORMS_TOLERANCE * template.grid.spacing.min():
+        return ()
+    return (
+        f"{path}: sform ({_space(sform)}) and qform ({_space(qform)}) place its voxels up to {apart:.3g} mm apart: the "
+        "sform is used",
+    )
+
+
+def _space(code: int) -> str:
+    return f"code {code}, {_SPACES.get(code, 'unknown')}"
 
 
 def _is_coloured(image: Any) -> bool:

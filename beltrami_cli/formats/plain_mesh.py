@@ -1,13 +1,34 @@
-"""Meshes in general formats, vertices in RAS mm: .ply and .vtk (numbers, triangles or lines), .obj, .stl, .glb."""
+"""Meshes in general formats: .ply and .vtk (numbers, triangles or lines), .obj, .stl, .glb.
+
+None of them says what frame its vertices are in: they are taken, and written, as scanner RAS mm.
+"""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from beltrami_cli.formats import checks, colours
+from beltrami_cli.formats.frames import StoredSurface
 from beltrami_cli.surface import Mesh
+
+
+def read_surface(path: Path, kind: str) -> StoredSurface:
+    """Triangles of a file of `kind` PLY, OBJ, STL or VTK, polygons cut into triangles; raises DataError as `checks`.
+
+    Vertices keep their order; the corners of an STL file, which has no vertices of its own, are merged where equal.
+    """
+    with checks.reading(path, kind):
+        match kind:
+            case "OBJ":
+                vertices, cells = _read_obj(path)
+            case "VTK":
+                vertices, cells = _read_vtk(path)
+            case _:
+                vertices, cells = _read_with_trimesh(path, kind)
+    return StoredSurface(vertices, cells)
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
@@ -56,6 +77,46 @@ def write_obj_lines(path: Path, mesh: Mesh) -> None:
     lines = [f"l {a} {b}" for a, b in mesh.cells + 1]
     with checks.writing(path):
         path.write_text("\n".join(["# vertices in RAS mm", *vertices, *lines, ""]), encoding="ascii", newline="\n")
+
+
+def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    mesh = trimesh.load(path, file_type=kind.lower(), process=False)
+    if kind == "STL":
+        mesh.merge_vertices()
+    # A file without faces comes as a cloud of points.
+    cells = getattr(mesh, "faces", np.empty((0, 3)))
+    return np.array(mesh.vertices, float), np.array(cells, np.int32)
+
+
+def _read_vtk(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    import meshio
+
+    content = meshio.vtk.read(path)  # not meshio.read, which prints and exits on what it does not know
+    quads = content.cells_dict.get("quad", np.empty((0, 4)))
+    triangles = content.cells_dict.get("triangle", np.empty((0, 3)))
+    return np.array(content.points, float), np.concatenate([triangles, quads[:, :3], quads[:, [0, 2, 3]]]).astype(
+        np.int32
+    )
+
+
+def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """By hand: trimesh repeats vertices that have several texture coordinates or materials, which changes their order.
+
+    Lines `v x y z ...` and `f a/b/c ...`, whose first numbers count vertices from 1, or from -1 backwards.
+    """
+    vertices: list[list[str]] = []
+    cells: list[tuple[int, int, int]] = []
+    for line in path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ").splitlines():
+        kind, *fields = line.split() or [""]
+        if kind == "v":
+            vertices.append(fields[:3])
+        elif kind == "f":
+            numbers = (int(field.split("/", 1)[0]) for field in fields)
+            first, *others = (n - 1 if n > 0 else len(vertices) + n for n in numbers)
+            cells += [(first, a, b) for a, b in pairwise(others)]
+    return np.array(vertices, float).reshape(-1, 3), np.array(cells, np.int32).reshape(-1, 3)
 
 
 def _numbers(mesh: Mesh) -> dict[str, np.ndarray]:

@@ -19,7 +19,7 @@ from beltrami_cli.grid import Grid, Volume, with_channels
 class Series:
     """The values of a file as its header announces them, none of them in memory before it is asked for.
 
-    count: number of channels or frames. file_shape, header: as those of `Volume`, of the whole file.
+    count: number of channels or frames. file_shape, header, notes: as those of `Volume`, of the whole file.
     frame: reads frame t, an array of `grid.shape`; raises DataError where the file is damaged there. In a compressed
         file a step back costs reading it from its start again.
     is_complex: a voxel is one complex number.
@@ -31,6 +31,7 @@ class Series:
     header: Any = field(repr=False)
     frame: Callable[[int], np.ndarray] = field(repr=False)
     is_complex: bool = False
+    notes: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[np.ndarray]:
         return (self.frame(t) for t in range(self.count))

@@ -1,0 +1,238 @@
+"""Whatever a surface is given as: a level-set volume, a segmentation or a mesh; and the level set of any of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from beltrami_cli import formats
+from beltrami_cli.distance import HALF_WIDTH, own_grid, signed_distance
+from beltrami_cli.errors import RefusedError
+from beltrami_cli.grid import Grid, Volume
+from beltrami_cli.inputs import require_usable
+from beltrami_cli.levelset import crossing_box, facing, two_values, zero_surface
+from beltrami_cli.segmentation import surface_of_labels
+from beltrami_cli.surface import Mesh
+
+# Labels as pairs (first, last): "5-255" is one pair, "2,41" two.
+Labels = tuple[tuple[int, int], ...]
+MOST_LISTED = 40  # labels in a message
+
+
+@dataclass(frozen=True)
+class LevelSet:
+    """A signed distance in mm, and lines for the user about it."""
+
+    volume: Volume
+    notes: tuple[str, ...]
+
+
+def read_source(
+    path: Path,
+    *,
+    labels: str | None = None,
+    between: str | None = None,
+    frame: str | None = None,
+    like: Grid | None = None,
+    spacing: tuple[float, ...] | None = None,
+    dtype: DTypeLike = np.float32,
+    notify: Callable[[str], None] | None = None,
+    beyond: float = 0.0,
+) -> Volume | Mesh:
+    """A level-set volume as it is; the surface of a segmentation, or of a surface file, as a mesh in RAS mm.
+
+    labels: which voxels of a segmentation are inside, as "2,41" or "5-255". between: the surface then lies midway
+        between two boundaries, "INNER,OUTER", each of them one label or several as in "2+41,0".
+    A volume is a segmentation where either is given, where it holds two values, one of them 0 or more (inside is what
+    it marks: the higher one, or that below 0), or where it holds non-negative whole numbers only.
+    frame, like: see `formats.read_surface`. spacing, dtype: see `formats.read_volume`.
+    notify: told what the reader has to say of a segmentation's file; a level set has it in its notes.
+    beyond: mm by which a segmentation is continued beyond the faces of its volume, as its outermost voxels are.
+
+    Raises RefusedError as `formats.read_volume` and `formats.read_surface` do; where labels are not wanted, not given
+    (the message names those that are there) or absent; DataError where the content cannot be used.
+    """
+    path = Path(path)
+    if labels is not None and between is not None:
+        raise RefusedError("--labels and --between both say where the surface is; give one of them")
+    wanted = None if labels is None else parse_labels(labels)
+    sides = None if between is None else parse_between(between)
+    if formats.is_surface(path):
+        if wanted or sides:
+            raise RefusedError(f"{path}: is a surface, which has no labels; drop --labels and --between")
+        return formats.read_surface(path, frame=frame, like=like)
+    if frame is not None:
+        raise RefusedError(f"{path}: --frame is for surface files; found a volume, whose header says where it is")
+    volume = formats.read_volume(path, spacing=spacing, dtype=dtype)
+    finite = volume.data[np.isfinite(volume.data)]
+    if not (wanted or sides or is_segmentation(finite)):
+        return volume
+    if notify:
+        for line in volume.notes:
+            notify(line)
+    return _surface_in(path, _continued(volume, beyond, "edge"), wanted, sides)
+
+
+def read_levelset(
+    path: Path,
+    *,
+    labels: str | None = None,
+    between: str | None = None,
+    frame: str | None = None,
+    like: Path | None = None,
+    spacing: tuple[float, ...] | None = None,
+    margin: float | None = None,
+) -> LevelSet:
+    """The signed distance to the surface that `path` holds, see `distance.signed_distance`.
+
+    On the grid of `like`; else on that of the volume itself; else on one around the surface (`distance.own_grid`) of
+    cubic voxels of `spacing` mm and with a `margin` in mm. spacing is otherwise that of the .npy files among the two.
+    A level-set volume is measured anew. Raises as `read_source`, and for options without a use.
+    """
+    giver = like or (None if formats.is_surface(path) else path)
+    place = None if giver is None else _place(giver, spacing)
+    _check_options(path, like, giver, spacing, margin)
+    notes = list(place.notes if place else ())
+    # As far as the level set reaches, so that the surface does not end where the volume does.
+    beyond = 0.0 if like or not place else (HALF_WIDTH + 1) * float(place.grid.spacing.max())
+    source = read_source(
+        path,
+        labels=labels,
+        between=between,
+        frame=frame,
+        like=place.grid if place else None,
+        spacing=spacing if _is_npy(path) else None,
+        notify=notes.append,
+        beyond=beyond,
+    )
+    if isinstance(source, Volume):
+        notes += source.notes
+        mesh = surface_of(_continued(source, beyond, "reflect", reflect_type="odd"))
+    else:
+        mesh = source
+    grid = place.grid if place else own_grid(mesh, spacing[0] if spacing else None, margin)
+    psi = signed_distance(mesh, grid)
+    if np.isnan(psi).any():
+        notes.append(f"{path}: the surface has a border: its level set is NaN beyond it, and far from the surface")
+    return LevelSet(Volume(psi, grid, (), place.header if place else None), tuple(dict.fromkeys(notes)))
+
+
+def _place(path: Path, spacing: tuple[float, ...] | None) -> formats.Series:
+    """Grid, header and notes of the volume whose grid the level set is to have, of any number of frames."""
+    if formats.is_surface(path):
+        raise RefusedError(f"--like {path}: is a surface; expected a volume, for its grid")
+    place = formats.open_series(path, spacing=spacing if _is_npy(path) else None)
+    require_usable(place.grid, str(path))
+    if 1 in place.grid.shape:
+        raise RefusedError(f"{path}: is a plane; expected a volume around a surface")
+    return place
+
+
+def _check_options(
+    path: Path, like: Path | None, giver: Path | None, spacing: tuple[float, ...] | None, margin: float | None
+) -> None:
+    """Raise RefusedError for options without a use."""
+    if margin is not None and giver:
+        raise RefusedError(f"--margin is for a grid around a surface; the level set has that of {giver}; drop it")
+    if spacing and giver and not any(_is_npy(file) for file in (path, like) if file):
+        raise RefusedError(
+            f"--spacing is for a grid around a surface, and for .npy files; the level set has the grid of {giver}; "
+            "drop it"
+        )
+    if spacing and not giver and len(spacing) > 1:
+        raise RefusedError(f"--spacing: found {spacing}; expected one number: a grid around a surface has cubes")
+
+
+def surface_of(volume: Volume) -> Mesh:
+    """The zero level of a level-set volume as a mesh in RAS mm, facing increasing Psi; DataError where it has none."""
+    box = crossing_box(volume.data, (1, 1, 1))
+    surface = zero_surface(volume.data[box], volume.grid.spacing)
+    ijk = surface.points / volume.grid.spacing + [part.start for part in box]
+    return Mesh(volume.grid.to_world(ijk), facing(surface.cells, volume.grid))
+
+
+def is_segmentation(finite: np.ndarray) -> bool:
+    """True where values (N,) are a mask or labels and no level set, see `read_source`; a constant is neither."""
+    if values := two_values(finite):
+        return bool(values[1] >= 0)
+    return bool(finite.size and finite.min() >= 0 and np.ptp(finite) > 0 and np.all(finite == np.rint(finite)))
+
+
+def parse_labels(given: str, separator: str = ",") -> Labels:
+    """Labels from "2,41" or "5-255"; raises RefusedError for anything else."""
+    pairs = []
+    for part in given.split(separator):
+        match = re.fullmatch(r"\s*(\d+)(?:-(\d+))?\s*", part)
+        if not match or int(match[2] or match[1]) < int(match[1]):
+            raise RefusedError(f"labels: found {given!r}; expected whole numbers or ranges of them, as 2,41 or 5-255")
+        pairs.append((int(match[1]), int(match[2] or match[1])))
+    return tuple(pairs)
+
+
+def parse_between(given: str) -> tuple[Labels, Labels]:
+    """The labels of two regions from "INNER,OUTER", joined by + in each; raises RefusedError for anything else."""
+    parts = given.split(",")
+    if len(parts) != 2:
+        raise RefusedError(f"between: found {given!r}; expected INNER,OUTER, each of them labels joined by +: 2+41,0")
+    return parse_labels(parts[0], "+"), parse_labels(parts[1], "+")
+
+
+def _surface_in(path: Path, volume: Volume, wanted: Labels | None, sides: tuple[Labels, Labels] | None) -> Mesh:
+    """The surface of a segmentation; raises RefusedError where it holds no labels, or others than are asked for."""
+    data, grid = volume.data, volume.grid
+    found = np.unique(data[np.isfinite(data)])
+    if two_values(found) is None and not np.array_equal(found, np.rint(found)):
+        raise RefusedError(
+            f"{path}: holds values from {found[0]:.4g} to {found[-1]:.4g} that are no whole numbers: no labels, but a "
+            "level set or an image; drop --labels and --between, or give the segmentation"
+        )
+    if wanted:
+        return surface_of_labels(data, grid, labels_inside=_present(path, wanted, found), between=None)
+    if sides:
+        inner, outer = (_present(path, side, found) for side in sides)
+        return surface_of_labels(data, grid, labels_inside=None, between=(inner, outer))
+    if len(found) > 2:
+        raise RefusedError(
+            f"{path}: holds the labels {_listed(found)}; --labels says which are inside (as in 2,41 or 5-255), or "
+            "--between INNER,OUTER between which of them the surface is"
+        )
+    return surface_of_labels(-data if found[0] < 0 else data, grid, labels_inside=None, between=None)
+
+
+def _present(path: Path, wanted: Labels, found: np.ndarray) -> tuple[int, ...]:
+    """Labels wanted, of ranges those that are there; raises RefusedError where one, or all of a range, are not."""
+    labels: list[int] = []
+    for first, last in wanted:
+        there = found[(found >= first) & (found <= last)]
+        if not len(there):
+            name = f"{first}" if first == last else f"{first}-{last}"
+            raise RefusedError(f"{path}: has no label {name}; found {_listed(found)}")
+        labels += there.astype(int).tolist()
+    return tuple(labels)
+
+
+def _listed(found: np.ndarray) -> str:
+    names = ", ".join(f"{label:g}" for label in found[:MOST_LISTED])
+    return names if len(found) <= MOST_LISTED else f"{names} ... {found[-1]:g} ({len(found)} values)"
+
+
+def _continued(volume: Volume, mm: float, mode: Any, **options: Any) -> Volume:
+    """The volume with voxels around it, `mm` wide, filled as `np.pad` does."""
+    if not mm:
+        return volume
+    voxels = np.ceil(mm / volume.grid.spacing).astype(int)
+    data = np.pad(volume.data, [(n, n) for n in voxels], mode, **options)
+    affine = volume.grid.affine.copy()
+    affine[:3, 3] -= affine[:3, :3] @ voxels
+    a, b, c = data.shape
+    return replace(volume, data=data, grid=Grid((a, b, c), affine), file_shape=())
+
+
+def _is_npy(path: Path) -> bool:
+    return Path(path).suffix.lower() == ".npy"
