@@ -88,11 +88,7 @@ class _Closed:
     """Distances to a closed surface."""
 
     def __init__(self, surface: Repaired) -> None:
-        import igl
-
         self.surface = surface
-        self.solid = igl.FastWindingNumberBVH()
-        self.solid.init(surface.vertices, surface.cells)
         self.skin = surface.cells[self._is_skin()]
 
     def distance(self, points: np.ndarray, width: float) -> np.ndarray:
@@ -102,8 +98,13 @@ class _Closed:
         kind = igl.SIGNED_DISTANCE_TYPE_UNSIGNED
         distance = igl.signed_distance(points, self.surface.vertices, self.skin, kind, -width, width)[0]
         near = np.isfinite(distance)
-        distance[near] *= np.where(self.solid.winding_number(points[near]) > 0.5, -1, 1)
+        distance[near] *= np.where(self._winding_number(points[near]) > 0.5, -1, 1)
         return distance
+
+    def _winding_number(self, points: np.ndarray) -> np.ndarray:
+        import igl
+
+        return np.asarray(igl.fast_winding_number(self.surface.vertices, self.surface.cells, points))
 
     def _is_skin(self) -> np.ndarray:
         """(C,) bool: triangles with the inside on one side only, not within an overlap.
@@ -120,7 +121,7 @@ class _Closed:
             rest = np.flatnonzero(~skin)
             points = (weights[0] * a + weights[1] * b + weights[2] * c + beside)[rest]
             if len(rest):
-                skin[rest] = np.abs(self.solid.winding_number(points)) < 0.5
+                skin[rest] = np.abs(self._winding_number(points)) < 0.5
         return skin
 
 
@@ -171,7 +172,7 @@ def _boxes(grid: Grid, vertices: np.ndarray, width: float) -> Iterator[tuple[tup
     thick = max(1, AT_ONCE // int(np.prod((high - low)[1:])))
     for start in range(low[0], high[0], thick):
         box = (slice(start, min(start + thick, high[0])), slice(low[1], high[1]), slice(low[2], high[2]))
-        centres = np.moveaxis(np.mgrid[box], 0, -1).reshape(-1, 3)
+        centres = np.mgrid[box].reshape(3, -1).T.astype(np.float64)
         yield box, np.ascontiguousarray(grid.to_world(centres))
 
 

@@ -270,15 +270,18 @@ def _survey(job: Job) -> _Scene:
     """What the job is about, from headers and surfaces; raises RefusedError where files will not do."""
     structure = None if job.structure is None else formats.parse_structure(job.structure)
     surface, at_vertices = None, False
+    if formats.is_surface(job.data):
+        raise RefusedError(f"DATA {job.data}: is a surface; expected data on one: are LEVELSET and DATA swapped?")
     if job.levelset is not None and formats.is_surface(job.levelset):
         at_vertices = formats.is_overlay(job.data)
         like = None if at_vertices else _grid_of(job, job.data, channels=job.settings.kind == "vector")
         surface = formats.read_surface(job.levelset, frame=job.frame, like=like)
         _require_sense(job, at_vertices)
     elif formats.is_overlay(job.data):
+        found = "no surface (flat)" if job.levelset is None else f"LEVELSET {job.levelset}, which is none"
         raise RefusedError(
-            f"DATA {job.data}: values at the vertices of a surface; found LEVELSET {job.levelset}, which is none: give "
-            "the surface as LEVELSET, or DATA as a volume"
+            f"DATA {job.data}: values at the vertices of a surface; found {found}: give the surface as LEVELSET, or "
+            "DATA as a volume"
         )
     if at_vertices:
         assert surface is not None
@@ -287,6 +290,11 @@ def _survey(job: Job) -> _Scene:
         for path in (job.volume, *([] if job.filled is None else [job.filled])):
             formats.overlay_files(path)
     else:
+        if job.volume.name.lower().endswith((".func.gii", ".shape.gii")):
+            raise RefusedError(
+                f"{job.volume}: holds values at vertices; found DATA {job.data}, a volume; give OUT as a volume, and "
+                "the values at a surface's vertices with --on SURFACE=FILE"
+            )
         grid = _check_grids(job, surface)
     job.settings.duration(time_step(grid, job.settings))
     if not job.settings.flat:

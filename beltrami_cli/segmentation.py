@@ -24,19 +24,23 @@ from beltrami_cli.surface import Mesh
 
 # Times that normals, curvatures and their average are taken anew, and steps towards the minimum in between: after them
 # a sphere of 40 voxels moves by 0.001 voxel a round.
-ROUNDS, STEPS = 8, 60
+ROUNDS, STEPS = 8, 80
 # The staircase's own normals are averaged over so many rings before the first round: about a terrace.
 FIRST_RINGS = 6
 # Rings that the average H* is taken over, one after the other (about 3 voxels): more prefers spheres, fewer planes.
-AVERAGE_RINGS = 6
+AVERAGE_RINGS = 10
 # Least share of a grid edge between a vertex and the voxel centres at its ends: triangles keep an area, banks a gap.
 MARGIN = 0.02
+# The same beside a voxel between two of the other side, as in a sulcus one voxel wide: its banks stay half a voxel apart.
+THIN_MARGIN = 0.25
 # Weight of the pull to the middle of the edge, 1/voxel^4: it only decides what curvature leaves open, as a flat face.
 PULL = 1e-6
 # An edge along the surface says nothing of its height: its vertex moves at most so far along it per unit of height.
 SLOPE = 0.02
+# Times that triangles which hang on one side only are cut where the surface ends at unknown voxels: its rim is ragged.
+EARS = 2
 # Distances are exact so many voxels on both sides of the mid surface: the cubic that places it reaches 2.
-NEAR = 3
+NEAR = 2.5
 # Two directions are opposed when their cosine is below this (120 degrees): a fundus or a corner has less.
 OPPOSED = -0.5
 # Psi, in voxels, at the least, where two banks touch: enough to be on the outer side.
@@ -200,11 +204,14 @@ class _Staircase:
     """The boundary of a mask as marching cubes gives it, not yet placed along the grid edges that it crosses.
 
     low: (V, 3) float64 voxel at the lower end of each vertex's edge. axis: (V,) that the edge runs along; -1 for the few
-    vertices in the middle of a cell, which follow their ring. cells, start, ring: see `ZeroSurface`, in index space.
+    vertices in the middle of a cell, which follow their ring. least, most: (V,) shares of the edge that it may lie
+    between. cells, start, ring: see `ZeroSurface`, in index space.
     """
 
     low: np.ndarray
     axis: np.ndarray
+    least: np.ndarray
+    most: np.ndarray
     cells: np.ndarray
     start: np.ndarray
     ring: np.ndarray
@@ -256,10 +263,25 @@ def _staircase(inside: np.ndarray, known: np.ndarray | None, grid: Grid) -> _Sta
         start, ring = kernels.half_edges(cells, len(ijk))
         crossed[middle] = np.logical_and.reduceat(crossed[ring] | middle[ring], start[:-1])[middle]
     cells = cells[crossed[cells].all(1)]
+    for _ in range(EARS if cells.shape[1] == 3 and not known.all() else 0):
+        cells = cells[(np.bincount(cells.ravel(), minlength=len(ijk))[cells] > 1).all(1)]
+    if not len(cells):
+        raise DataError("the segmentation has no boundary among the voxels known; expected a face of one cell at least")
+    corners = cells.shape[1]
     used, cells = np.unique(cells, return_inverse=True)
-    cells = cells.reshape(-1, ijk.shape[1] if psi.shape[2] > 1 else 2).astype(np.int32)
+    cells = cells.reshape(-1, corners).astype(np.int32)
     start, ring = kernels.half_edges(cells, len(used))
-    return _Staircase(low[used] + [part.start for part in box], axis[used], cells, start, ring)
+    least, most = _margins(psi, low[used].astype(int), axis[used])
+    return _Staircase(low[used] + [part.start for part in box], axis[used], least, most, cells, start, ring)
+
+
+def _margins(psi: np.ndarray, low: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The shares (V,) of its edge that each vertex may lie between: farther from a voxel between two of the other sign."""
+    steps = np.eye(3, dtype=int)[axis]
+    before, here, there, after = (
+        psi[tuple(np.clip(low + k * steps, 0, np.array(psi.shape) - 1).T)] for k in (-1, 0, 1, 2)
+    )
+    return np.where(before == there, THIN_MARGIN, MARGIN), 1 - np.where(after == here, THIN_MARGIN, MARGIN)
 
 
 def _box(inside: np.ndarray, known: np.ndarray) -> tuple[slice, ...]:
@@ -317,9 +339,9 @@ def _fair(stairs: _Staircase, axes: np.ndarray) -> np.ndarray:
             curvature = np.where(stairs.border, 0, curvature - average)
         climb = (normals * edge).sum(1)
         climb = np.where(np.abs(climb) < SLOPE, np.copysign(SLOPE, climb), climb)
-        low, high = np.sort([climb * (MARGIN - share), climb * (1 - MARGIN - share)], axis=0)
+        low, high = np.sort([climb * (stairs.least - share), climb * (stairs.most - share)], axis=0)
         heights = fairing.fair_heights(curvature, weight, *mesh, back, low, high, climb * (0.5 - share), PULL, STEPS)
-        share = np.clip(share + heights / climb, MARGIN, 1 - MARGIN)
+        share = np.clip(share + heights / climb, stairs.least, stairs.most)
     return share
 
 

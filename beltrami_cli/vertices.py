@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from beltrami_cli.errors import DataError
 from beltrami_cli.grid import Grid, Volume
 from beltrami_cli.inputs import Warnings, without
 from beltrami_cli.kinds import kind_of
+from beltrami_cli.record import sha256
 from beltrami_cli.resample import at_points
 from beltrami_cli.surface import Mesh
 
@@ -133,7 +133,7 @@ def _record(
     return {
         "GeneratedBy": [{"Name": "beltrami_cli", "Version": __version__}],
         "Sources": [
-            {"Path": os.fspath(path), "SHA256": _sha256(path), "Role": role} for path, role in job.sources.items()
+            {"Path": os.fspath(path), "SHA256": sha256(path), "Role": role} for path, role in job.sources.items()
         ],
         "Outputs": [os.fspath(file) for file in files],
         "Created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -149,8 +149,3 @@ def _record(
         "Vertices": counts,
         "Warnings": list(warnings.lines),
     }
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -14,15 +14,15 @@ GRID = Grid.from_spacing((40, 40, 40))
 CENTRE = np.array([19.637, 19.2, 19.9])
 
 
-def sphere(radius: float = 12.0, centre: np.ndarray = CENTRE, *, finer: int = 5) -> Mesh:
-    """finer 5: 10,242 vertices, whose triangles lie up to 0.0003 of the radius within the sphere."""
+def sphere(radius: float = 12.0, centre: np.ndarray = CENTRE, *, finer: int = 4) -> Mesh:
+    """finer 4: 2,562 vertices, whose triangles lie up to 0.0012 of the radius within the sphere; 5: a quarter of it."""
     import trimesh
 
     made = trimesh.creation.icosphere(subdivisions=finer)
     return Mesh(np.array(made.vertices) * radius + centre, np.array(made.faces, np.int32))
 
 
-def torus(centre: np.ndarray, around: int = 300, across: int = 130, radii: tuple[float, float] = (18, 8)) -> Mesh:
+def torus(centre: np.ndarray, around: int = 240, across: int = 110, radii: tuple[float, float] = (18, 8)) -> Mesh:
     i, j = np.indices((around, across))
     u, v = 2 * np.pi * i / around, 2 * np.pi * j / across
     ring = radii[0] + radii[1] * np.cos(v)
@@ -96,7 +96,7 @@ def test_sphere_on_any_grid(axes):
     affine[:3, :3] = axes
     affine[:3, 3] = CENTRE - axes @ np.full(3, 19.6)
     grid = Grid((40, 40, 40), affine)
-    psi = signed_distance(sphere(), grid)
+    psi = signed_distance(sphere(finer=5), grid)
     width = HALF_WIDTH * grid.spacing.max()
     assert psi.dtype == np.float32
     assert np.abs(psi - np.clip(to_sphere(grid), -width, width)).max() <= 0.01 * grid.spacing.min()
@@ -111,7 +111,7 @@ def test_torus():
 
 
 def test_half_width():
-    psi = signed_distance(sphere(), GRID, 2.5)
+    psi = signed_distance(sphere(finer=5), GRID, 2.5)
     assert np.abs(psi - np.clip(to_sphere(), -2.5, 2.5)).max() <= 0.01
 
 
@@ -185,7 +185,7 @@ def test_needles_make_no_difference(whole):
 
 def test_of_overlapping_parts_the_union_counts():
     apart = np.array([5.0, 0, 0])
-    psi = signed_distance(joined(sphere(9, CENTRE - apart), sphere(9, CENTRE + apart)), GRID)
+    psi = signed_distance(joined(*(sphere(9, CENTRE + side * apart, finer=5) for side in (-1, 1))), GRID)
     left, right = to_sphere(radius=9, centre=CENTRE - apart), to_sphere(radius=9, centre=CENTRE + apart)
     union = np.minimum(left, right)
     assert np.abs(union[(psi < 0) != (union < 0)]).max(initial=0) <= 0.01
@@ -199,7 +199,7 @@ def test_of_overlapping_parts_the_union_counts():
 
 
 def test_a_part_within_another_does_not_count_a_cavity_does():
-    outer, inner = sphere(12), sphere(6)
+    outer, inner = sphere(12, finer=5), sphere(6)
     whole = signed_distance(outer, GRID)
     assert np.abs(signed_distance(joined(outer, inner), GRID) - whole).max() < 1e-5
     hollow = signed_distance(joined(outer, Mesh(inner.vertices_ras_mm, inner.cells[:, ::-1])), GRID)
@@ -219,14 +219,14 @@ def test_half_a_sphere_ends_at_its_rim(whole):
     rim_z = half.vertices[half.border][..., 2]
     z = centres(GRID)[..., 2]
     assert not known[z > rim_z.max()].any()
-    assert known[(z < rim_z.min()) & (np.abs(whole) < 5.9)].all()
+    assert known[(z < rim_z.min() - 1) & (np.abs(whole) < 5.9)].all()
     band = build_band(psi, GRID, 4.0)
     assert band.surface is not None
     low = band.box[2].start
     top = band.surface.points[:, 2].max() + low
     assert rim_z.max() - 1 <= top <= rim_z.max()
     points = band.surface.points + [part.start for part in band.box]
-    assert np.abs(np.linalg.norm(points - CENTRE, axis=1) - 12).max() <= 0.02  # no cap
+    assert np.abs(np.linalg.norm(points - CENTRE, axis=1) - 12).max() <= 0.03  # no cap
 
 
 def test_a_large_hole_stays_open_and_a_small_one_is_closed():
@@ -308,7 +308,7 @@ def test_no_surface_at_all(vertices, cells, said):
 
 
 def test_own_grid_has_the_median_edge_and_room_for_the_band():
-    mesh = sphere(finer=4)
+    mesh = sphere()
     grid = own_grid(mesh)
     ends = mesh.vertices_ras_mm[mesh.cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)]
     edge = np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
@@ -353,7 +353,7 @@ def test_a_band_is_built_on_it():
     assert band.entries == pytest.approx(8 * area, rel=0.05)
 
 
-REAL = {"retino_fsaverage": "lh.crop", "s1_individual": "lh.mid.crop", "retino_hcp7t_measured": "lh.crop"}
+REAL = {"retino_fsaverage": "lh.crop", "s1_individual": "lh.mid.crop"}
 
 
 @pytest.mark.parametrize("name", REAL)

@@ -7,7 +7,6 @@ import numba as nb
 import numpy as np
 
 from beltrami_cli.kernels import BLOCK
-from beltrami_cli.kernels import total as total_of
 
 # Least half mean square radius of a ring, in units squared, that a curvature is taken from.
 LEAST_RING = 0.01
@@ -97,74 +96,62 @@ def mean_curvatures(points, normals, start, ring, border):
     return curvature, weight
 
 
-@nb.njit(cache=True, parallel=True)
+@nb.njit(cache=True)
 def ring_average(values, counted, start, ring, rounds):
     """(V,) values averaged over each vertex and its ring, so many times, those not counted left out."""
     for _ in range(rounds):
-        out = np.empty_like(values)
-        for v in nb.prange(len(values)):
+        out = np.zeros_like(values)
+        for v in range(len(values)):
             total, number = 0.0, 0
             if counted[v]:
                 total, number = values[v], 1
             for q in range(start[v], start[v + 1]):
-                w = ring[q]
-                if counted[w]:
-                    total += values[w]
+                if counted[ring[q]]:
+                    total += values[ring[q]]
                     number += 1
             out[v] = total / max(number, 1)
         values = out
     return values
 
 
-@nb.njit(cache=True, parallel=True)
-def row_sums(weight, start, ring, back):
-    """Sums over each row: of A's weights (V,), and of |A^T| |A| (V,), where A u = sum w_j (u_j - u_i)."""
-    count = len(start) - 1
-    total, size, bound = np.zeros(count), np.zeros(count), np.zeros(count)
-    for v in nb.prange(count):
+@nb.njit(cache=True)
+def fair_heights(constant, weight, start, ring, back, low, high, middle, pull, steps):
+    """u (V,) between low and high with the least |A u + constant|^2 + pull |u - middle|^2, A u = sum w_j (u_j - u_i).
+
+    Accelerated projected gradients (Nesterov), restarted where they overshoot (O'Donoghue and Candes 2015). The step of
+    each unknown is the row sum of |A^T| |A|, which majorises A^T A. In one thread: threads would meet at every step.
+    """
+    count = len(constant)
+    transposed = weight[back]
+    total, size, bound = np.zeros(count, weight.dtype), np.zeros(count), np.zeros(count, weight.dtype)
+    for v in range(count):
         for q in range(start[v], start[v + 1]):
             total[v] += weight[q]
             size[v] += abs(weight[q])
         size[v] += abs(total[v])
-    for v in nb.prange(count):
-        bound[v] = abs(total[v]) * size[v]
+    for v in range(count):
+        bound[v] = pull + abs(total[v]) * size[v]
         for q in range(start[v], start[v + 1]):
-            bound[v] += abs(weight[back[q]]) * size[ring[q]]
-    return total, bound
-
-
-@nb.njit(cache=True, parallel=True)
-def fair_heights(constant, weight, start, ring, back, low, high, middle, pull, steps):
-    """u (V,) between low and high with the least |A u + constant|^2 + pull |u - middle|^2; A as in `row_sums`.
-
-    Accelerated projected gradients (Nesterov), restarted where they overshoot (O'Donoghue and Candes 2015). The step of
-    each unknown is the row sum of |A^T| |A|, which majorises A^T A.
-    """
-    count = len(constant)
-    total, bound = row_sums(weight, start, ring, back)
-    blocks = (count + BLOCK - 1) // BLOCK
-    u = np.minimum(np.maximum(0.0, low), high)
-    ahead, residual, uphill = u.copy(), np.empty(count), np.empty(blocks)
+            bound[v] += abs(transposed[q]) * size[ring[q]]
+    u = np.minimum(np.maximum(weight.dtype.type(0), low), high)
+    ahead, residual = u.copy(), np.empty_like(u)
     pace = 1.0
     for _ in range(steps):
-        for v in nb.prange(count):
+        for v in range(count):
             r = constant[v] - total[v] * ahead[v]
             for q in range(start[v], start[v + 1]):
                 r += weight[q] * ahead[ring[q]]
             residual[v] = r
         following = (1 + np.sqrt(1 + 4 * pace**2)) / 2
         momentum = (pace - 1) / following
-        for block in nb.prange(blocks):
-            overshoot = 0.0
-            for v in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-                slope = pull * (ahead[v] - middle[v]) - total[v] * residual[v]
-                for q in range(start[v], start[v + 1]):
-                    slope += weight[back[q]] * residual[ring[q]]
-                step = bound[v] + pull
-                moved = min(max(ahead[v] - slope / step, low[v]), high[v])
-                overshoot += step * (ahead[v] - moved) * (moved - u[v])
-                ahead[v] = moved + momentum * (moved - u[v])
-                u[v] = moved
-            uphill[block] = overshoot
-        pace = 1.0 if total_of(uphill) > 0 else following
+        overshoot = 0.0
+        for v in range(count):
+            slope = pull * (ahead[v] - middle[v]) - total[v] * residual[v]
+            for q in range(start[v], start[v + 1]):
+                slope += transposed[q] * residual[ring[q]]
+            moved = min(max(ahead[v] - slope / bound[v], low[v]), high[v])
+            overshoot += bound[v] * (ahead[v] - moved) * (moved - u[v])
+            ahead[v] = moved + momentum * (moved - u[v])
+            u[v] = moved
+        pace = 1.0 if overshoot > 0 else following
     return u
