@@ -10,7 +10,7 @@ from beltrami_cli.band import Band, band_around, build_band, flat_band
 from beltrami_cli.config import Settings
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.flows import DT_SHARE, stability_bound
-from beltrami_cli.grid import Grid
+from beltrami_cli.grid import Canonical, Grid
 from beltrami_cli.levelset import refined, two_values
 from beltrami_cli.segmentation import smooth_surface
 from beltrami_cli.surface import Mesh
@@ -68,23 +68,6 @@ def grid_around(mesh: Mesh, settings: Settings, spacing: float | None = None) ->
     return Grid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
 
 
-class PlaneLast:
-    """Brings a plane's missing axis to the end, where the band expects it, and back."""
-
-    def __init__(self, grid: Grid) -> None:
-        single = [axis for axis in range(3) if grid.shape[axis] == 1]
-        self.axis = single[0] if single else 2
-        order = [a for a in range(3) if a != self.axis] + [self.axis]
-        a, b, c = (grid.shape[k] for k in order)
-        self.grid = Grid((a, b, c), grid.affine[:, [*order, 3]])
-
-    def forth(self, array: np.ndarray) -> np.ndarray:
-        return np.moveaxis(array, self.axis, 2)
-
-    def back(self, array: np.ndarray) -> np.ndarray:
-        return np.moveaxis(array, 2, self.axis)
-
-
 class Warnings:
     """Collects lines for the user, and tells each at once to whoever listens."""
 
@@ -98,28 +81,28 @@ class Warnings:
             self._notify(line)
 
 
-def band_of(psi: np.ndarray | None, settings: Settings, plane: PlaneLast, warnings: Warnings) -> Band:
+def band_of(psi: np.ndarray | None, settings: Settings, axes: Canonical, warnings: Warnings) -> Band:
     """The band around the zero level of psi on the volume's own grid; the flat one where psi is None.
 
     Of a mask, the surface is the smooth one of `segmentation.smooth_surface`; in a plane the mask's own staircase.
     """
     if psi is None:
-        return flat_band(plane.grid)
-    psi, half_width = plane.forth(psi), settings.half_width(plane.grid.used_spacing)
+        return flat_band(axes.grid)
+    psi, half_width = axes.forth(psi), settings.half_width(axes.grid.used_spacing)
     mask = two_values(psi)
     sign = -1 if settings.inside == "positive" else 1
     if mask and mask[0] >= 0:  # a mask of something: what it marks is inside, whatever the sign
         psi, sign = (mask[0] + mask[1]) / 2 - psi, 1
     if not mask:
-        return build_band(sign * psi, plane.grid, half_width)
+        return build_band(sign * psi, axes.grid, half_width)
     if 1 not in psi.shape:
-        mesh = smooth_surface(sign * psi < 0, plane.grid, np.isfinite(psi))
-        return band_around(refined(mesh, plane.grid).surface, plane.grid, half_width)
+        mesh = smooth_surface(sign * psi < 0, axes.grid, np.isfinite(psi))
+        return band_around(refined(mesh, axes.grid).surface, axes.grid, half_width)
     warnings.add(
         f"the level set holds two values only ({mask[0]:g} and {mask[1]:g}): a mask, whose outline is a staircase of "
         "pixels, accurate to half of one; give a signed distance or another smooth function for a better one"
     )
-    return build_band(sign * psi, plane.grid, half_width)
+    return build_band(sign * psi, axes.grid, half_width)
 
 
 def trusted(

@@ -9,8 +9,8 @@ import numpy as np
 from beltrami_cli import formats
 from beltrami_cli.config import Settings
 from beltrami_cli.errors import BeltramiError, RefusedError
-from beltrami_cli.grid import Grid, Volume, require_same_grid
-from beltrami_cli.inputs import PlaneLast, Warnings, band_of, require_usable
+from beltrami_cli.grid import Canonical, Grid, Volume, require_same_grid
+from beltrami_cli.inputs import Warnings, band_of, require_usable
 from beltrami_cli.levelset import crossing_box, two_values
 from beltrami_cli.metrics import Difference, difference
 from beltrami_cli.sources import is_segmentation
@@ -62,12 +62,12 @@ def _near_surface(psi: Volume, name: str, within: float | None) -> np.ndarray:
     if within is not None and not 0 < within < np.inf:
         raise RefusedError(f"within: found {within:g}; expected a distance above 0 mm")
     require_usable(psi.grid, name)
-    plane = PlaneLast(psi.grid)
+    axes = Canonical(psi.grid)
     widest = float(psi.grid.used_spacing.max())
     reach = 0.5 * widest if within is None else within
     # Wider than what is looked at: a band's own rim is where the nearest vertex, not the surface, is in reach.
-    band = band_of(psi.data, Settings(band=reach + 1.5 * widest), plane, Warnings(None))
-    distance = plane.back(band.scatter(np.abs(band.distance), np.inf))
+    band = band_of(psi.data, Settings(band=reach + 1.5 * widest), axes, Warnings(None))
+    distance = axes.back(band.scatter(np.abs(band.distance), np.inf))
     return np.asarray(distance <= reach)
 
 

@@ -16,8 +16,8 @@ from beltrami_cli.config import Job, Settings
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import own_samples
-from beltrami_cli.grid import Grid, Volume, require_same_grid, with_channels
-from beltrami_cli.inputs import PlaneLast, Warnings, band_of, grid_around, require_usable, time_step, without
+from beltrami_cli.grid import Canonical, Grid, Volume, require_same_grid, with_channels
+from beltrami_cli.inputs import Warnings, band_of, grid_around, require_usable, time_step, without
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import sha256, sidecar
@@ -207,8 +207,8 @@ def mesh_of(
     """
     psi = formats.read_volume(levelset, spacing=_spacing_for(levelset, spacing))
     require_usable(psi.grid, str(levelset))
-    plane = PlaneLast(psi.grid)
-    band = band_of(psi.data, Settings(inside=inside), plane, Warnings(None))
+    axes = Canonical(psi.grid)
+    band = band_of(psi.data, Settings(inside=inside), axes, Warnings(None))
     if data is None:
         return surface_mesh(band)[0]
     flat = 1 in psi.grid.shape
@@ -217,7 +217,7 @@ def mesh_of(
     if bring:
         volume = resample(volume, psi.grid, period=period)
     require_same_grid(psi.grid, f"LEVELSET {levelset}", volume.grid, f"DATA {data}", remedy=REMEDY)
-    here = band.gather(plane.forth(volume.data))
+    here = band.gather(axes.forth(volume.data))
     kind = kind_of("circular" if period else "vector", here, period)[0]
     own = own_samples(band, kind.to_channels(here))
     mesh, values = surface_mesh(band, own, turns=kind.turns)

@@ -9,27 +9,27 @@ import numpy as np
 
 from beltrami_cli.band import Band
 from beltrami_cli.extension import own_samples
-from beltrami_cli.inputs import PlaneLast
+from beltrami_cli.grid import Canonical
 from beltrami_cli.kinds import Kind
 from beltrami_cli.observed import AtVertices, AtVoxels, Observed, VertexBand
 
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """The voxels of the band's grid, as the caller's plane has its axes.
+    """The voxels of the band's grid, its axes brought to those of the band by `axes`.
 
     extension, depth: see `extension.extend`. outside: what a result holds beyond the band, "nan", "zero" or "keep".
     """
 
     band: Band
-    plane: PlaneLast
+    axes: Canonical
     extension: str
     depth: tuple[float, float] | None
     outside: str
 
     def take(self, volume: np.ndarray) -> np.ndarray:
         """(E, ...) values of a volume at the entries' voxels."""
-        return self.band.gather(self.plane.forth(volume))
+        return self.band.gather(self.axes.forth(volume))
 
     def observe(self, here: np.ndarray, kind: Kind, trust: np.ndarray) -> Observed:
         """What was taken, `here` (E, ...) of weights `trust` (E,), as channels of the entries that it belongs to."""
@@ -40,12 +40,12 @@ class Voxels:
         """The band's values (K, E) as a volume in the shape and kind of the `given` one."""
         out = kind.to_values(values)
         nan = complex(np.nan, np.nan) if np.iscomplexobj(out) else np.nan
-        outside: dict[str, np.ndarray | complex] = {"nan": nan, "zero": 0.0, "keep": self.plane.forth(given)}
-        return self.plane.back(self.band.scatter(out, outside[self.outside]))
+        outside: dict[str, np.ndarray | complex] = {"nan": nan, "zero": 0.0, "keep": self.axes.forth(given)}
+        return self.axes.back(self.band.scatter(out, outside[self.outside]))
 
     def filled(self, values: np.ndarray, known: np.ndarray, observed: Observed) -> np.ndarray:
         """bool volume: where values (K, E) are, though the data around (those `known`, (E,)) gave none."""
-        return self.plane.back(self.band.scatter(~known & ~np.isnan(values[0]), 0.0))
+        return self.axes.back(self.band.scatter(~known & ~np.isnan(values[0]), 0.0))
 
 
 @dataclass(frozen=True, eq=False)

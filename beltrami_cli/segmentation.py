@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from beltrami_cli.errors import DataError, RefusedError
-from beltrami_cli.grid import Grid
+from beltrami_cli.grid import Canonical, Grid
 from beltrami_cli.kernels import fairing
 from beltrami_cli.kernels import mesh as kernels
 from beltrami_cli.levelset import contour, isosurface, thin_first, two_values, zero_surface
@@ -34,15 +34,15 @@ MARGIN = 0.02
 # The same beside a voxel between two of the other side, as in a sulcus one voxel wide: its banks stay half a voxel apart.
 THIN_MARGIN = 0.25
 # Weight of the pull to the middle of the edge, 1/voxel^4: it only decides what curvature leaves open, as a flat face.
-PULL = 1e-6
+PULL = 1e-4
 # An edge along the surface says nothing of its height: its vertex moves at most so far along it per unit of height.
 SLOPE = 0.02
-# Times that triangles which hang on one side only are cut where the surface ends at unknown voxels: its rim is ragged.
-EARS = 2
 # Distances are exact so many voxels on both sides of the mid surface: the cubic that places it reaches 2.
 NEAR = 2.5
 # Two directions are opposed when their cosine is below this (120 degrees): a fundus or a corner has less.
 OPPOSED = -0.5
+# Below this (90 degrees) they still lead on from outer voxels to where banks touch, as at the mouth of a sulcus.
+SPREAD = 0.0
 # Psi, in voxels, at the least, where two banks touch: enough to be on the outer side.
 KEPT_APART = 0.05
 
@@ -101,6 +101,10 @@ def smooth_surface(inside: np.ndarray, grid: Grid, known: np.ndarray | None = No
     the border of what is known and at the faces of the volume. A plane (one axis of length 1, the last) gives a polyline.
     Raises DataError where no voxel inside lies beside one outside.
     """
+    # Marching cubes and the fairing go by the order of the voxels: how the mask is stored must not show.
+    canonical = Canonical(grid)
+    inside, grid = canonical.forth(inside), canonical.grid
+    known = None if known is None else canonical.forth(known)
     stairs = _staircase(inside, known, grid)
     # World lengths and angles in a frame whose third axis stays a plane's normal; units of the finest voxel.
     axes = np.linalg.cholesky(grid.affine[:3, :3].T @ grid.affine[:3, :3]).T / grid.used_spacing.min()
@@ -118,6 +122,10 @@ def mid_surface(inner: np.ndarray, outer: np.ndarray, grid: Grid, known: np.ndar
     of the other count as outer, if they go on from outer voxels: the banks stay apart. Raises DataError where one of the
     regions has no boundary.
     """
+    # Marching cubes and the fairing go by the order of the voxels: how the mask is stored must not show.
+    canonical = Canonical(grid)
+    inner, outer, grid = canonical.forth(inner), canonical.forth(outer), canonical.grid
+    known = None if known is None else canonical.forth(known)
     known = np.ones(inner.shape, bool) if known is None else known
     ends = [(part.start, part.stop) for region in (inner, outer) for part in _box(region, known)]
     low, high = np.min([ends[:3], ends[3:]], 0)[:, 0], np.max([ends[:3], ends[3:]], 0)[:, 1]
@@ -136,7 +144,7 @@ def _equidistance(
     """(distance to inner - distance to outer) / 2 in mm: exact near its zero level, from voxel to voxel elsewhere."""
     spacing = grid.spacing
     to_inner, to_outer = _voxel_distance(inner, spacing), _voxel_distance(outer, spacing)
-    apart, between = _meeting(inner, outer, known, spacing)
+    apart, between = _meeting(inner, outer, known, to_outer, spacing)
     psi = (to_inner - np.minimum(to_outer, _voxel_distance(apart, spacing) if apart.any() else np.inf)) / 2
     near = np.nonzero(known & (np.abs(psi) < NEAR * spacing.max()))
     ijk = np.stack(near, 1)
@@ -169,7 +177,7 @@ def _distance(points_ras_mm: np.ndarray, mesh: Mesh) -> np.ndarray:
 
 
 def _meeting(
-    inner: np.ndarray, outer: np.ndarray, known: np.ndarray, spacing: np.ndarray
+    inner: np.ndarray, outer: np.ndarray, known: np.ndarray, to_outer: np.ndarray, spacing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where banks touch in a sulcus: voxels (nx, ny, nz), and points (P, 3) in voxel indices as far from one as the other.
 
@@ -180,20 +188,23 @@ def _meeting(
     distance, feet = distance_transform_edt(~inner, sampling=spacing, return_indices=True)
     away = (np.indices(inner.shape) - feet) * spacing.reshape(3, 1, 1, 1) / np.maximum(distance, 1e-30)
     tissue = known & ~inner & ~outer
-    met, points = np.zeros(inner.shape, bool), []
+    met, path, points = np.zeros(inner.shape, bool), outer & known, []
     for axis in range(3):
         a = tuple(slice(None, -1) if k == axis else slice(None) for k in range(3))
         b = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
-        opposed = ((away[:, *a] * away[:, *b]).sum(0) < OPPOSED) & tissue[a] & tissue[b]
-        met[a] |= opposed
-        met[b] |= opposed
+        cosine = np.where(tissue[a] & tissue[b], (away[:, *a] * away[:, *b]).sum(0), 1)
+        opposed = cosine < OPPOSED
+        for voxels, there in ((met, opposed), (path, cosine < SPREAD)):
+            voxels[a] |= there
+            voxels[b] |= there
         rise, fall = away[axis][a][opposed], away[axis][b][opposed]
         gap = (distance[b] - distance[a])[opposed] / spacing[axis]
         at = np.argwhere(opposed).astype(float)
         at[:, axis] += np.clip((gap - fall) / np.where(rise > fall, rise - fall, np.inf), 0, 1)
         points.append(at)
     # A dent of the inner boundary has opposed sides too, but is no sulcus: it does not go on from outer voxels.
-    joined = binary_propagation(outer & known, mask=met | (outer & known), structure=np.ones((3, 3, 3))) & met
+    joined = met & binary_propagation(outer & known, mask=path, structure=np.ones((3, 3, 3)))
+    joined &= to_outer > distance / 2  # nearer, the outer voxels themselves keep the banks apart
     at = np.concatenate(points)
     nearest = tuple(np.round(at).astype(int).T)
     return joined, at[joined[nearest]]
@@ -222,18 +233,16 @@ class _Staircase:
         return self.axis >= 0
 
     @cached_property
-    def border(self) -> np.ndarray:
-        """(V,) bool: at the end of an open surface, where a ring is no disc."""
-        corners = self.cells.shape[1]
+    def across(self) -> np.ndarray:
+        """(N,) bool: entries of `ring` from a vertex of the border into the surface; false for a polyline."""
+        count, corners = len(self.low), self.cells.shape[1]
         if corners == 2:
-            return np.bincount(self.cells.ravel(), minlength=len(self.low)) == 1
+            return np.zeros(len(self.ring), bool)
         # Each directed side of a triangle is met by its reverse, but at the border.
-        count = len(self.low)
         a, b = (c.ravel().astype(np.int64) for c in (self.cells, np.roll(self.cells, -1, 1)))
         sides = np.setxor1d(a * count + b, b * count + a)
-        out = np.zeros(count, bool)
-        out[sides // count] = out[sides % count] = True
-        return out
+        row = np.repeat(np.arange(count), np.diff(self.start))
+        return np.isin(row, sides // count) & ~np.isin(row * count + self.ring, sides)
 
     def place(self, share: np.ndarray) -> np.ndarray:
         """(V, 3) voxel indices of the vertices at `share` (V,) of their edges."""
@@ -263,8 +272,6 @@ def _staircase(inside: np.ndarray, known: np.ndarray | None, grid: Grid) -> _Sta
         start, ring = kernels.half_edges(cells, len(ijk))
         crossed[middle] = np.logical_and.reduceat(crossed[ring] | middle[ring], start[:-1])[middle]
     cells = cells[crossed[cells].all(1)]
-    for _ in range(EARS if cells.shape[1] == 3 and not known.all() else 0):
-        cells = cells[(np.bincount(cells.ravel(), minlength=len(ijk))[cells] > 1).all(1)]
     if not len(cells):
         raise DataError("the segmentation has no boundary among the voxels known; expected a face of one cell at least")
     corners = cells.shape[1]
@@ -333,10 +340,9 @@ def _fair(stairs: _Staircase, axes: np.ndarray) -> np.ndarray:
     for number in range(ROUNDS):
         points = stairs.place(share) @ axes.T
         normals = _normals(points, stairs, FIRST_RINGS if number == 0 else 1)
-        curvature, weight = fairing.mean_curvatures(points, normals, *mesh, stairs.border)
+        curvature, weight, counted = fairing.mean_curvatures(points, normals, *mesh, stairs.across)
         if number:  # the staircase's own curvature says nothing
-            average = fairing.ring_average(curvature, ~stairs.border, *mesh, AVERAGE_RINGS)
-            curvature = np.where(stairs.border, 0, curvature - average)
+            curvature -= counted * fairing.ring_average(curvature, counted, *mesh, AVERAGE_RINGS)
         climb = (normals * edge).sum(1)
         climb = np.where(np.abs(climb) < SLOPE, np.copysign(SLOPE, climb), climb)
         low, high = np.sort([climb * (stairs.least - share), climb * (stairs.most - share)], axis=0)

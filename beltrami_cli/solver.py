@@ -17,9 +17,8 @@ from beltrami_cli.errors import DataError, NumericsError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import Extended
 from beltrami_cli.geodesic import distance_along
-from beltrami_cli.grid import Grid
+from beltrami_cli.grid import Canonical, Grid
 from beltrami_cli.inputs import (
-    PlaneLast,
     Warnings,
     band_of,
     finite_or_missing,
@@ -112,23 +111,23 @@ class Solver:
         self.planner = Planner(settings, iterations, ends_by, phases, warnings)
         self.places: Voxels | Vertices
         shape: tuple[int, ...] = grid.shape
+        axes = Canonical(grid)
         with phases("band"):
             self.shown: list[tuple[Mesh, SurfacePoints]] = []
             if isinstance(surface, Mesh):
-                of_mesh = VertexBand(surface, grid, settings.half_width(grid.used_spacing))
-                self.band, plane = of_mesh.band, PlaneLast(grid)
+                of_mesh = VertexBand(surface, axes.grid, settings.half_width(grid.used_spacing))
+                self.band = of_mesh.band
                 self.shown.append((surface, of_mesh.vertices))
                 self._tell_lost(of_mesh)
             else:
-                plane = PlaneLast(grid)
-                self.band = band_of(surface, settings, plane, warnings)
+                self.band = band_of(surface, settings, axes, warnings)
                 if surface is not None:
                     self.shown.append((surface_mesh(self.band)[0], own_vertices(self.band)))
             if at_vertices:
                 assert isinstance(surface, Mesh)
                 self.places, shape = Vertices(of_mesh), (len(surface.vertices_ras_mm),)
             else:
-                self.places = Voxels(self.band, plane, settings.extension, settings.depth, settings.outside)
+                self.places = Voxels(self.band, axes, settings.extension, settings.depth, settings.outside)
             self.trust = self.places.take(trusted(weights, mask, shape, settings, warnings))
             self.shown += [(mesh, self._found(mesh)) for mesh in on]
             self.course = Course(self.band, Kind(), dt, settings.reextends_every, settings.fidelity or 0.0)

@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 from beltrami_cli import formats
 from beltrami_cli.distance import HALF_WIDTH, own_grid, signed_distance
 from beltrami_cli.errors import RefusedError
-from beltrami_cli.grid import Grid, Volume
+from beltrami_cli.grid import Canonical, Grid, Volume
 from beltrami_cli.inputs import require_usable
 from beltrami_cli.levelset import crossing_box, facing, two_values, zero_surface
 from beltrami_cli.segmentation import surface_of_labels
@@ -151,10 +151,12 @@ def _check_options(
 
 def surface_of(volume: Volume) -> Mesh:
     """The zero level of a level-set volume as a mesh in RAS mm, facing increasing Psi; DataError where it has none."""
-    box = crossing_box(volume.data, (1, 1, 1))
-    surface = zero_surface(volume.data[box], volume.grid.spacing)
-    ijk = surface.points / volume.grid.spacing + [part.start for part in box]
-    return Mesh(volume.grid.to_world(ijk), facing(surface.cells, volume.grid))
+    canonical = Canonical(volume.grid)
+    psi, grid = canonical.forth(volume.data), canonical.grid
+    box = crossing_box(psi, (1, 1, 1))
+    surface = zero_surface(psi[box], grid.spacing)
+    ijk = surface.points / grid.spacing + [part.start for part in box]
+    return Mesh(grid.to_world(ijk), facing(surface.cells, grid))
 
 
 def is_segmentation(finite: np.ndarray) -> bool:

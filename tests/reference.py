@@ -271,6 +271,47 @@ def closest_on_quadric(x, k1, k2):
     return np.array([*s, -(k * s**2).sum() / 2])
 
 
+def closest_on_triangle(p, corners):
+    """Weights (3,) of the corners (3, 3) for the point of a triangle nearest to p, and its squared distance.
+
+    The nearest of: the foot on the plane where it lies within, the feet on the edges, the corners.
+    """
+    found = list(np.eye(3))
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        edge = corners[j] - corners[i]
+        if (edge**2).sum() > 0:
+            t = np.clip((p - corners[i]) @ edge / (edge @ edge), 0, 1)
+            found.append((1 - t) * np.eye(3)[i] + t * np.eye(3)[j])
+    sides = np.stack([corners[1] - corners[0], corners[2] - corners[0]], 1)
+    if np.linalg.matrix_rank(sides) == 2:
+        v, w = np.linalg.lstsq(sides, p - corners[0], rcond=None)[0]
+        if min(v, w, 1 - v - w) >= 0:
+            found.append(np.array([1 - v - w, v, w]))
+    apart = [((p - weights @ corners) ** 2).sum() for weights in found]
+    return found[int(np.argmin(apart))], min(apart)
+
+
+def straight_on(points, around, before, here):
+    """Of the neighbours `around` one vertex, the one least off the direction from `before` to it, ahead; else -1."""
+    way = points[here] - points[before]
+    to = {w: points[w] - points[here] for w in around[here] if np.linalg.norm(points[w] - points[here]) > 0}
+    cosine = {w: way @ step / np.linalg.norm(step) for w, step in to.items()}
+    best = max(cosine, key=cosine.__getitem__, default=-1)
+    return best if best >= 0 and cosine[best] > 0 else -1
+
+
+def entry_at_point(band, ijk, own):
+    """The entry, of those in the 8 voxels around ijk (3,), whose vertex is nearest to `own` on the same side; or -1."""
+    surface, at = band.surface, np.stack(np.unravel_index(band.voxel, band.box_shape), 1)
+    near = np.all((at == np.floor(ijk)) | (at == np.floor(ijk) + 1), axis=1)
+    near &= band.normal.T @ surface.normals[own] > 0
+    if not near.any():
+        return -1
+    apart = np.linalg.norm((surface.points[band.vertex] - surface.points[own]) / band.grid.spacing, axis=1)
+    e = int(np.where(near, apart, np.inf).argmin())
+    return e if apart[e] < 2.5 else -1
+
+
 def opposite_links(band) -> Iterator[np.ndarray]:
     """For each axis (E,) bool: whether every link forward is one backward too, and the other way round."""
     own = np.arange(band.entries)

@@ -85,7 +85,7 @@ def test_observer_sees_every_iteration():
 
 
 def test_warnings_are_handed_back():
-    (line,) = denoise(ball() < 0, noisy(), beta=0.1).warnings
+    (line,) = denoise(ball((32, 32), 10.0) < 0, noisy((32, 32)), beta=0.1).warnings
     assert "two values only" in line
 
 

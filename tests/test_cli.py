@@ -24,7 +24,10 @@ from beltrami_cli.cli import beltrami as group
 
 OPTIONS = {
     "denoise": "-o --mesh --no-mesh --flow --phi --beta --eps --scheme --iterations --time --fwhm --dt --extension "
-    "--extend-every --band --spacing --resample --inside --outside --precision --config --threads --flat --overwrite",
+    "--extend-every --band --spacing --resample --inside --outside --precision --config --threads --flat --overwrite "
+    "--on --labels --between --map --frame --structure",
+    "levelset": "-o --labels --between --like --spacing --margin --frame --overwrite",
+    "sample": "-o --kind --period --missing --frame --structure --spacing --overwrite",
     "mesh": "-o --spacing --resample --inside --overwrite",
     "phantom": "--size --noise --seed --format --overwrite",
     "compare": "--levelset --within --period --max-abs --max-rms --min-psnr --data-range --json",
@@ -151,10 +154,10 @@ def test_quiet_is_silent_and_verbose_says_more(scene):
 
 
 def test_warnings_are_silent_under_quiet_and_stay_in_the_sidecar(scene, tmp_path):
-    _, data, out = scene
-    mask = nifti(tmp_path / "mask.nii.gz", (ball() < 0).astype(np.uint8))
-    assert done("denoise", mask, data, "-o", out, "--quiet").out == ""
-    assert "two values only" in record(tmp_path / "out.json")["Warnings"][0]
+    levelset, data, out = scene
+    weights = nifti(tmp_path / "weights.nii.gz", np.where(ball() < 0, 1, -1e-4).astype(np.float32))
+    assert done("denoise", levelset, data, "-o", out, "--weights", weights, "--quiet").out == ""
+    assert "taken as 0" in record(tmp_path / "out.json")["Warnings"][0]
 
 
 def test_progress_bar_on_a_terminal_only(scene):
@@ -497,7 +500,7 @@ def test_unusable_data(scene, tmp_path, case):
         (np.abs(ball()), 1, "no zero level"),
         (np.zeros((16, 16, 16), np.float32), 1, "found values from 0 to 0"),
         (NAN, 1, "no finite value"),
-        ((ball() < 0).astype(np.int16) + (ball() < -2), 1, "found values from 0 to 2"),
+        ((ball() < 0).astype(np.int16) + (ball() < -2), 2, "labels 0, 1, 2"),
     ],
     ids=["positive", "unsigned", "zero", "NaN", "labels"],
 )

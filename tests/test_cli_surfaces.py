@@ -62,7 +62,7 @@ def test_mesh_in_mesh_out(folder):
     run = done("denoise", "lh.surf.gii", "lh.map.func.gii", "-o", "o.func.gii", *L2)
     assert run.out.startswith("wrote o.func.gii, o.surf.gii, o.func.json\n")
     out, expected = values(Path("o.func.gii")), denoise(MESH, NOISY, flow="l2", iterations=10).data
-    assert np.abs(out - expected).max() < 1e-4
+    assert np.abs(out - expected).max() < 1e-4 * np.ptp(NOISY)
     error, before = (np.sqrt(np.mean((x - 10 * HEIGHT) ** 2)) for x in (out, NOISY))
     assert error < 0.3 * before
     vertices, triangles = (array.data for array in nib.load("o.surf.gii").darrays)
@@ -97,7 +97,8 @@ def test_what_is_written_for_an_output_at_vertices(folder, out, files):
     done("denoise", "lh.surf.gii", "lh.map.func.gii", "-o", out, *L2)
     assert {path.name for path in folder.iterdir()} - before == set(files)
     if out == "lh.o":
-        assert np.allclose(read_morph_data(out), denoise(MESH, NOISY, flow="l2", iterations=10).data, atol=1e-4)
+        expected = denoise(MESH, NOISY, flow="l2", iterations=10).data
+        assert np.abs(read_morph_data(out) - expected).max() < 1e-4 * np.ptp(NOISY)
 
 
 def test_meshes_that_are_named_hold_the_values(folder):
@@ -105,7 +106,7 @@ def test_meshes_that_are_named_hold_the_values(folder):
     expected = load(Path("o.mgz"))[:, 0, 0]
     assert np.array_equal(values(Path("m.func.gii")), expected)
     trimesh = pytest.importorskip("trimesh")
-    found = trimesh.load("m.ply", process=False).vertex_attributes["value"]
+    found = trimesh.load("m.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]["value"]
     assert np.array_equal(np.ravel(found), expected)
     done("denoise", "lh.surf.gii", "lh.map", "-o", "p.func.gii", "--mesh", "p.surf.gii", *L2)
     assert np.array_equal(values(Path("p.func.gii")), expected)
@@ -117,7 +118,7 @@ def test_one_map_of_several(folder):
     assert "two.func.gii" in message and "--map" in message
     done("denoise", "lh.surf.gii", "two.func.gii", "-o", "o.func.gii", "--map", "2", *L2)
     one = values(Path("o.func.gii"))
-    assert np.allclose(one, denoise(MESH, NOISY, flow="l2", iterations=10).data, atol=1e-4)
+    assert np.abs(one - denoise(MESH, NOISY, flow="l2", iterations=10).data).max() < 1e-4 * np.ptp(NOISY)
     done("denoise", "lh.surf.gii", "two.func.gii", "-o", "s.func.gii", "--kind", "vector", "--independent", *L2)
     assert np.allclose(values(Path("s.func.gii")), np.stack([one + 5, one], -1), atol=1e-3)
     assert nib.load("s.func.gii").darrays[0].intent == nib.nifti1.intent_codes["NIFTI_INTENT_TIME_SERIES"]

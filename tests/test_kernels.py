@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import reference
+import trimesh
 
+from beltrami_cli.band import band_around
+from beltrami_cli.grid import Grid
 from beltrami_cli.kernels import extend, interpolate, mesh, metric, sheets, steps
+from beltrami_cli.levelset import refined
+from beltrami_cli.sampling import SurfacePoints
+from beltrami_cli.surface import Mesh
 
 LAWS = list(reference.DIFFUSIVITY)
 SPACINGS = [(1.0, 1.0, 1.0), (0.7, 1.1, 2.3)]
@@ -413,6 +419,107 @@ def test_half_edges(cells):
     start, ring = mesh.half_edges(cells, 6)
     expected = reference.neighbours(cells)
     assert [sorted(ring[start[v] : start[v + 1]].tolist()) for v in range(6)] == [sorted(s) for s in expected]
+
+
+def test_faces_around():
+    rng = np.random.default_rng(12)
+    cells = np.array([rng.choice(9, 3, replace=False) for _ in range(14)], np.int32)  # of 10 vertices, one without
+    start, face = mesh.faces_around(cells, 10)
+    assert [face[start[v] : start[v + 1]].tolist() for v in range(10)] == [
+        np.flatnonzero((cells == v).any(1)).tolist() for v in range(10)
+    ]
+
+
+TRIANGLES = {
+    "acute": [[0, 0, 0], [1, 0, 0], [0.4, 0.9, 0]],
+    "obtuse": [[0, 0, 0], [4, 0.3, 1], [1, 0.2, 0.1]],
+    "needle": [[0, 0, 0], [1, 0, 0], [0.5, 1e-9, 0]],
+    "on a line": [[0, 0, 0], [1, 0, 0], [2, 0, 0]],
+    "on a line, back": [[0, 0, 0], [2, 0, 0], [1, 0, 0]],
+    "two in one": [[0, 0, 0], [0, 0, 0], [1, 1, 0]],
+    "a point": [[1, 1, 1], [1, 1, 1], [1, 1, 1]],
+}
+
+
+@pytest.mark.parametrize("corners", TRIANGLES.values(), ids=TRIANGLES.keys())
+def test_barycentric(corners):
+    """Every region of the plane: inside, beyond each edge and each corner; triangles without area too."""
+    rng, corners, weights = np.random.default_rng(13), np.array(corners, float), np.empty(3)
+    for p in np.concatenate([rng.normal(size=(200, 3), scale=2), corners, corners.mean(0)[None]]):
+        squared = mesh.barycentric(p, *corners, weights)
+        expected, apart = reference.closest_on_triangle(p, corners)
+        assert weights.min() >= -1e-12 and weights.sum() == pytest.approx(1, abs=1e-12)
+        assert squared == pytest.approx(apart, abs=1e-9)
+        assert ((p - weights @ corners) ** 2).sum() == pytest.approx(apart, abs=1e-9)
+        if np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) > 1e-3:
+            assert np.allclose(weights, expected, atol=1e-9)
+
+
+def bumpy(seed=14, n=7):
+    """Points (n n + 1, 3) of a rough sheet in disorder, one of no face, and its triangles."""
+    rng = np.random.default_rng(seed)
+    x, y = (a.ravel().astype(float) for a in np.mgrid[:n, :n])
+    points = np.stack([x, y, np.sin(x) * np.cos(y)], 1) + rng.normal(scale=0.2, size=(n * n, 3))
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (part.ravel() for part in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    cells = rng.permutation(np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32))
+    return np.concatenate([points, [[0, 0, 9.0]]]), cells
+
+
+def test_nearest_on_faces():
+    rng, (points, cells) = np.random.default_rng(15), bumpy()
+    vertex = rng.integers(0, len(points), 60)
+    queries = points[vertex] + rng.normal(scale=0.7, size=(60, 3))
+    corners, weights = mesh.nearest_on_faces(
+        queries, vertex, points, cells, *mesh.faces_around(cells, len(points))
+    )  # fmt: skip
+    assert (weights[vertex == len(points) - 1] == 0).all()
+    for query, v, corner, weight in zip(queries, vertex, corners, weights, strict=True):
+        around = cells[(cells == v).any(1)].tolist()
+        if around:
+            nearest = min(reference.closest_on_triangle(query, points[cell])[1] for cell in around)
+            assert sorted(corner) in map(sorted, around)
+            assert ((query - weight @ points[corner]) ** 2).sum() == pytest.approx(nearest, abs=1e-12)
+
+
+def test_straight_walks():
+    points, cells = bumpy()
+    points[8] = points[9]  # two vertices at one place: no direction leads from one to the other
+    start, ring = mesh.half_edges(cells, len(points))
+    walks, around = mesh.straight_walks(points, start, ring, 3), reference.neighbours(cells)
+    for v in range(len(points) - 1):
+        forth = [ring[start[v]]]
+        back = [reference.straight_on(points, around, forth[0], v)]
+        for way in (forth, back):
+            while len(way) < 3:
+                before = [v, *way][-2]
+                way.append(-1 if way[-1] < 0 else reference.straight_on(points, around, before, way[-1]))
+        assert walks[v].tolist() == [forth, back]
+    assert (walks[-1] == -1).all()
+
+
+@pytest.mark.parametrize("gap", [None, 0.4])
+def test_entries_at_points(gap):
+    """Beside one bank, or between two that face each other 0.4 voxels apart: one's own entry, never the other's."""
+    ball = trimesh.creation.icosphere(2, radius=5.0)
+    shells = [(1.0, 1)] if gap is None else [(1.0, -1), (1 + gap / 5, 1)]
+    vertices = np.concatenate([np.array(ball.vertices) * size for size, _ in shells]) + 10
+    cells = np.concatenate([np.array(ball.faces)[:, ::way] + k * 162 for k, (_, way) in enumerate(shells)])
+    grid = Grid.from_spacing((21, 21, 21))
+    band = band_around(refined(Mesh(vertices, cells), grid).surface, grid, 3.0)
+    rng = np.random.default_rng(16)
+    own = rng.integers(0, len(vertices), 150)
+    ijk = band.surface.points[own] + rng.normal(scale=[[0.5], [1.0], [3.0]] * 50, size=(150, 3))
+    found = SurfacePoints(band, ijk, own)
+    expected = [reference.entry_at_point(band, x, v) for x, v in zip(ijk, own, strict=True)]
+    assert {-1} < set(expected)
+    nearest = band.surface.points[band.vertex[found.start]]
+    asked = band.surface.points[band.vertex[expected]]
+    assert np.array_equal(found.start < 0, np.array(expected) < 0)
+    there = found.start >= 0
+    assert np.allclose(*(np.linalg.norm(x - band.surface.points[own], axis=1)[there] for x in (nearest, asked)))
+    at = np.stack(np.unravel_index(band.voxel[found.start], band.box_shape), 1)
+    assert np.allclose((at + found.offset.T)[there], ijk[there], atol=1e-5)
 
 
 @pytest.mark.parametrize("curvatures", [(0.1, 0.1), (0.15, -0.1), (0.2, 0.0), (-0.12, -0.05)])

@@ -8,7 +8,7 @@ import numpy as np
 
 from beltrami_cli.kernels import BLOCK
 
-# Least half mean square radius of a ring, in units squared, that a curvature is taken from.
+# Least half sum of squares of a ring, in units squared, that a curvature is taken from.
 LEAST_RING = 0.01
 # Added to a ring's second moments, relative to their sum: a ring on a line, as a polyline's, determines one tilt only.
 RIDGE = 1e-4
@@ -41,28 +41,35 @@ def solve_symmetric(m, b):
     )
 
 
+@nb.njit(cache=True)
+def parts(points, v, w, n0, n1, n2):
+    """From vertex v to w: the height along the normal n, and the three components along the tangent plane."""
+    t0, t1, t2 = points[w, 0] - points[v, 0], points[w, 1] - points[v, 1], points[w, 2] - points[v, 2]
+    h = t0 * n0 + t1 * n1 + t2 * n2
+    return h, t0 - h * n0, t1 - h * n1, t2 - h * n2
+
+
 @nb.njit(cache=True, parallel=True)
-def mean_curvatures(points, normals, start, ring, border):
-    """Mean curvature H (V,) and the weights (N,) of what it changes by, sum w_j (u_j - u_i), for heights u (V,).
+def mean_curvatures(points, normals, start, ring, across):
+    """Mean curvature H (V,), the weights (N,) of what it changes by, sum w_j (u_j - u_i), for heights u (V,); where it
+    counts (V,).
 
     With t and h the parts of x_j - x_i along the tangent plane and the normal, H = sum w h with w = c (1 - a . t). The
     tilt a makes sum w t = 0, so that a tilt of the normal is no curvature however uneven the ring, and c makes
-    sum w t^2 = 2. At the border, where no such ring is, all are 0.
+    sum w t^2 = 2. Entries `across` (N,) a border are left out: there, H is the curvature along it. Where the ring is too
+    small, or no such weights are, H and w are 0 and do not count.
     """
-    curvature, weight = np.zeros(len(points)), np.zeros(len(ring))
+    curvature, weight, counted = np.zeros(len(points)), np.zeros(len(ring)), np.zeros(len(points), np.bool_)
     for block in nb.prange((len(points) + BLOCK - 1) // BLOCK):
         moments, mean = np.empty(6), np.empty(3)
         for v in range(block * BLOCK, min(len(points), (block + 1) * BLOCK)):
-            if border[v]:
-                continue
             n0, n1, n2 = normals[v, 0], normals[v, 1], normals[v, 2]
             moments[:] = 0
             mean[:] = 0
             for q in range(start[v], start[v + 1]):
-                w = ring[q]
-                t0, t1, t2 = points[w, 0] - points[v, 0], points[w, 1] - points[v, 1], points[w, 2] - points[v, 2]
-                h = t0 * n0 + t1 * n1 + t2 * n2
-                t0, t1, t2 = t0 - h * n0, t1 - h * n1, t2 - h * n2
+                if across[q]:
+                    continue
+                h, t0, t1, t2 = parts(points, v, ring[q], n0, n1, n2)
                 moments[0] += t0 * t0
                 moments[1] += t0 * t1
                 moments[2] += t0 * t2
@@ -82,18 +89,18 @@ def mean_curvatures(points, normals, start, ring, border):
             a0, a1, a2 = solve_symmetric(moments, mean)
             bend, spread = 0.0, 0.0
             for q in range(start[v], start[v + 1]):
-                w = ring[q]
-                t0, t1, t2 = points[w, 0] - points[v, 0], points[w, 1] - points[v, 1], points[w, 2] - points[v, 2]
-                h = t0 * n0 + t1 * n1 + t2 * n2
-                t0, t1, t2 = t0 - h * n0, t1 - h * n1, t2 - h * n2
+                if across[q]:
+                    continue
+                h, t0, t1, t2 = parts(points, v, ring[q], n0, n1, n2)
                 weight[q] = 1 - (a0 * t0 + a1 * t1 + a2 * t2)
                 bend += weight[q] * h
                 spread += weight[q] * (t0 * t0 + t1 * t1 + t2 * t2)
-            scale = 1 / max(spread / 2, LEAST_RING)
+            counted[v] = spread > 2 * LEAST_RING
+            scale = 2 / spread if counted[v] else 0.0
             for q in range(start[v], start[v + 1]):
                 weight[q] *= scale
             curvature[v] = scale * bend
-    return curvature, weight
+    return curvature, weight, counted
 
 
 @nb.njit(cache=True)
