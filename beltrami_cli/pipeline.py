@@ -24,7 +24,7 @@ from beltrami_cli.record import sha256, sidecar
 from beltrami_cli.resample import resample
 from beltrami_cli.sampling import surface_mesh
 from beltrami_cli.solver import Gathered, Result, Solver
-from beltrami_cli.sources import read_source
+from beltrami_cli.sources import is_segmentation, read_source
 from beltrami_cli.surface import Mesh
 
 REMEDY = "--resample brings it onto the level set's grid"
@@ -80,6 +80,11 @@ class _Scene:
     on: tuple[Mesh, ...]
     structure: str | None
 
+    @property
+    def place(self) -> Volume:
+        """A volume without values on the grid."""
+        return Volume(np.broadcast_to(np.False_, self.grid.shape), self.grid)
+
     def structure_of(self, mesh: Mesh) -> str | None:
         return self.structure or mesh.structure
 
@@ -93,7 +98,8 @@ def _denoise_volume(
         psi = source if isinstance(source, Volume) else None
         plane = _is_plane(job, scene.grid)
         data = _read(job, job.data, warnings, channels=job.settings.kind == "vector", plane=plane)
-        data = _onto(_that_counts(data, trust, job), psi, job, f"DATA {job.data}", period=job.settings.period)
+        place = psi or scene.place
+        data = _onto(_that_counts(data, trust, job), place, job, f"DATA {job.data}", period=job.settings.period)
         if psi is not None and formats.volume_format(job.volume) != formats.volume_format(job.data):
             data = replace(data, header=psi.header)
     solver = _solver(job, scene, source, trust, psi or data, phases, warnings)
@@ -119,15 +125,14 @@ def _denoise_series(
             plane=_is_plane(job, scene.grid),
         )
         _pass_on(series, warnings)
-    like = series if psi is None else replace(series, grid=psi.grid)
-    # An empty volume in whose place the frames are, for what has to be brought onto their grid.
-    place = psi or Volume(np.empty(like.grid.shape, bool), like.grid)
+    place = psi or scene.place
+    like = replace(series, grid=place.grid)
     solver = _solver(job, scene, source, trust, place, phases, warnings)
 
     def frame(t: int) -> np.ndarray:
         with phases("read"):
             data = _that_counts(Volume(series.frame(t), series.grid), trust, job)
-            return _onto(data, psi, job, f"DATA {job.data}").data
+            return _onto(data, place, job, f"DATA {job.data}").data
 
     record: dict[str, Any] = {}
     gathered = Gathered()
@@ -247,6 +252,11 @@ class _Files:
         files_of = formats.overlay_files if scene.at_vertices else formats.volume_files
         filled = [] if job.filled is None else files_of(job.filled)
         on = [file for _, path in job.on for file in formats.overlay_files(path)]
+        for file in on:
+            if file in written:
+                raise RefusedError(
+                    f"on: {file} is also where the values of the mesh beside OUT go; give another name, or --no-mesh"
+                )
         stem = formats.stem(job.volume)
         self.sidecar = stem.with_name(stem.name + ".json")
         self.all = [*files_of(job.volume), *filled, *written, *on, self.sidecar]
@@ -339,9 +349,8 @@ def _check_grids(job: Job, surface: Mesh | None) -> Grid:
         raise RefusedError("spacing: is for .npy inputs only; found none among LEVELSET and DATA; drop --spacing")
     several = job.settings.kind == "vector"
     grids: dict[str, tuple[Path, Grid]] = {}
-    # A surface has no grid, and that of a segmentation need not be that of the data.
-    own_grid = surface is None and not (job.labels or job.between)
-    levelset = job.levelset if own_grid else None
+    on_its_grid = surface is None and not _has_a_grid_of_its_own(job, several)
+    levelset = job.levelset if on_its_grid else None
     for name, path in zip(
         ("LEVELSET", "DATA", "weights", "mask"), (levelset, job.data, job.weights, job.mask), strict=True
     ):
@@ -354,7 +363,7 @@ def _check_grids(job: Job, surface: Mesh | None) -> Grid:
         if not job.resample:
             require_same_grid(grid, f"{first} {where}", other, f"{name} {path}", remedy=REMEDY)
     require_usable(grid, str(where))
-    if not own_grid and 1 in grid.shape and job.levelset is not None:
+    if not on_its_grid and 1 in grid.shape and job.levelset is not None:
         raise RefusedError(
             f"DATA {where}: found a plane; expected a volume around the surface of LEVELSET {job.levelset}"
         )
@@ -363,6 +372,16 @@ def _check_grids(job: Job, surface: Mesh | None) -> Grid:
     if job.filled is not None:
         formats.require_writable(job.filled, grid)
     return grid
+
+
+def _has_a_grid_of_its_own(job: Job, several: bool) -> bool:
+    """True for a segmentation on another grid than DATA, where neither is to be brought onto the other's."""
+    if job.levelset is None or job.resample:
+        return False
+    if job.labels or job.between:
+        return True
+    grids = _grid_of(job, job.levelset), _grid_of(job, job.data, channels=several)
+    return not grids[0].matches(grids[1]) and is_segmentation(_read(job, job.levelset, Warnings(None)).data)
 
 
 def _grid_of(job: Job, path: Path, *, channels: bool = False, plane: bool = False) -> Grid:

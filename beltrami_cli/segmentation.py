@@ -1,10 +1,10 @@
 """From a segmentation to a smooth surface that keeps every voxel centre on its side.
 
-The boundary of a mask crosses the grid edges between a voxel inside and one outside; where along the edge, the mask does
-not say. The surface here is the one whose curvature varies least among all that cross the same edges: each vertex has
-one degree of freedom, its place along its edge. No voxel centre changes sides, no bank of a thin sulcus touches the next,
-and the surface stays within half a voxel of the staircase. With H the mean curvature and H* its average over the mesh
-nearby, it minimises sum (H - H*)^2: 0 for planes, cylinders and spheres, so that nothing shrinks.
+The boundary of a mask crosses the grid edges between a voxel inside and one outside; where along the edge, the mask
+does not say. The surface here is the one whose curvature varies least among all that cross the same edges: each vertex
+has one degree of freedom, its place along its edge. No voxel centre changes sides, no bank of a thin sulcus touches the
+next, and the surface stays within half a voxel of the staircase. With H the mean curvature and H* its average over the
+mesh nearby, sum (H - H*)^2 becomes small: 0 for planes, cylinders and spheres, so that nothing shrinks.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from beltrami_cli.kernels import mesh as kernels
 from beltrami_cli.levelset import contour, isosurface, thin_first, two_values, zero_surface
 from beltrami_cli.surface import Mesh
 
-# Times that normals, curvatures and their average are taken anew, and steps towards the minimum in between: after them
-# a sphere of 40 voxels moves by 0.001 voxel a round.
+# Times that normals, curvatures and their average are taken anew, and steps towards the minimum in between: enough to
+# round off terraces up to about 15 voxels wide; four times as many reach twice as far.
 ROUNDS, STEPS = 8, 80
 # The staircase's own normals are averaged over so many rings before the first round: about a terrace.
 FIRST_RINGS = 6
-# Rings that the average H* is taken over, one after the other (about 3 voxels): more prefers spheres, fewer planes.
+# Rings that the average H* is taken over, one after the other (about 4 voxels): more keeps spheres, fewer planes.
 AVERAGE_RINGS = 10
 # Least share of a grid edge between a vertex and the voxel centres at its ends: triangles keep an area, banks a gap.
 MARGIN = 0.02
-# The same beside a voxel between two of the other side, as in a sulcus one voxel wide: its banks stay half a voxel apart.
+# The same beside a voxel between two of the other side, as in a sulcus one voxel wide: its banks keep half of it.
 THIN_MARGIN = 0.25
 # Weight of the pull to the middle of the edge, 1/voxel^4: it only decides what curvature leaves open, as a flat face.
 PULL = 1e-4
-# An edge along the surface says nothing of its height: its vertex moves at most so far along it per unit of height.
+# An edge along the surface says nothing of its height: its vertex moves along it by 1/SLOPE of a height at most.
 SLOPE = 0.02
 # Distances are exact so many voxels on both sides of the mid surface: the cubic that places it reaches 2.
 NEAR = 2.5
 # Two directions are opposed when their cosine is below this (120 degrees): a fundus or a corner has less.
 OPPOSED = -0.5
-# Below this (90 degrees) they still lead on from outer voxels to where banks touch, as at the mouth of a sulcus.
-SPREAD = 0.0
+# Below this (60 degrees) they still lead on from outer voxels to where banks touch, as at the mouth of a sulcus.
+SPREAD = 0.5
 # Psi, in voxels, at the least, where two banks touch: enough to be on the outer side.
 KEPT_APART = 0.05
 
@@ -88,7 +88,7 @@ def _require(labels: np.ndarray, wanted: tuple[int, ...]) -> None:
         raise RefusedError(f"label {_listed(absent)} is not in the segmentation; found {_listed(there)}")
 
 
-def _listed(labels: Sequence[float]) -> str:
+def _listed(labels: Sequence[float] | np.ndarray) -> str:
     """Labels for a message, the first 40 of them."""
     names = [f"{label:g}" for label in labels[:40]]
     return ", ".join([*names, f"... ({len(labels)} values)"] if len(labels) > 40 else names) or "none"
@@ -97,9 +97,10 @@ def _listed(labels: Sequence[float]) -> str:
 def smooth_surface(inside: np.ndarray, grid: Grid, known: np.ndarray | None = None) -> Mesh:
     """The boundary of a mask without its staircase, in RAS mm, facing outwards.
 
-    inside: (nx, ny, nz) bool. known: (nx, ny, nz) bool, where `inside` counts; everywhere if None. The surface is open at
-    the border of what is known and at the faces of the volume. A plane (one axis of length 1, the last) gives a polyline.
-    Raises DataError where no voxel inside lies beside one outside.
+    inside: (nx, ny, nz) bool. known: (nx, ny, nz) bool, where `inside` counts; everywhere if None. The surface is open
+    at the border of what is known and at the faces of the volume. A plane (the last axis of length 1) gives a polyline.
+    Thin structures stay whole: where two banks could be joined or kept apart, as across a diagonal, the thinner side
+    wins. Raises DataError where no voxel inside lies beside one outside.
     """
     # Marching cubes and the fairing go by the order of the voxels: how the mask is stored must not show.
     canonical = Canonical(grid)
@@ -116,11 +117,12 @@ def smooth_surface(inside: np.ndarray, grid: Grid, known: np.ndarray | None = No
 def mid_surface(inner: np.ndarray, outer: np.ndarray, grid: Grid, known: np.ndarray | None = None) -> Mesh:
     """The surface at equal distance from the boundaries of two regions, in RAS mm, facing the outer one.
 
-    inner, outer: (nx, ny, nz) bool, white matter and what lies beyond the pial surface; the tissue is what lies between.
-    known: see `smooth_surface`. The zero level of (distance to inner - distance to outer) / 2, both to the smooth surface.
-    Where two banks of a sulcus touch, with no outer voxel between, the places as far from the white of one as from that
-    of the other count as outer, if they go on from outer voxels: the banks stay apart. Raises DataError where one of the
-    regions has no boundary.
+    inner, outer: (nx, ny, nz) bool, white matter and what lies beyond the pial surface; the tissue is what lies
+    between. known: see `smooth_surface`. It is the zero level of (distance to inner - distance to outer) / 2, both to
+    the smooth surfaces. Where two banks of a sulcus touch, with no outer voxel between, the places as far from the
+    white of one as from that of the other count as outer, if they go on from outer voxels: the banks stay apart while
+    the white is three voxels apart or more; under that, they are one. Raises DataError where one of the regions has no
+    boundary.
     """
     # Marching cubes and the fairing go by the order of the voxels: how the mask is stored must not show.
     canonical = Canonical(grid)
@@ -179,7 +181,7 @@ def _distance(points_ras_mm: np.ndarray, mesh: Mesh) -> np.ndarray:
 def _meeting(
     inner: np.ndarray, outer: np.ndarray, known: np.ndarray, to_outer: np.ndarray, spacing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where banks touch in a sulcus: voxels (nx, ny, nz), and points (P, 3) in voxel indices as far from one as the other.
+    """Where banks touch in a sulcus: voxels (nx, ny, nz), and points (P, 3) in voxels, as far from one as the other.
 
     Two neighbours of the tissue whose nearest inner voxels lie in opposed directions have such a point between them.
     """
@@ -214,9 +216,9 @@ def _meeting(
 class _Staircase:
     """The boundary of a mask as marching cubes gives it, not yet placed along the grid edges that it crosses.
 
-    low: (V, 3) float64 voxel at the lower end of each vertex's edge. axis: (V,) that the edge runs along; -1 for the few
-    vertices in the middle of a cell, which follow their ring. least, most: (V,) shares of the edge that it may lie
-    between. cells, start, ring: see `ZeroSurface`, in index space.
+    low: (V, 3) float64, the voxel at the lower end of each vertex's edge. axis: (V,) that the edge runs along; -1 for
+    the few vertices in the middle of a cell, which follow their ring. least, most: (V,) shares of the edge that it may
+    lie between. cells, start, ring: see `ZeroSurface`, in index space.
     """
 
     low: np.ndarray
@@ -283,7 +285,7 @@ def _staircase(inside: np.ndarray, known: np.ndarray | None, grid: Grid) -> _Sta
 
 
 def _margins(psi: np.ndarray, low: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The shares (V,) of its edge that each vertex may lie between: farther from a voxel between two of the other sign."""
+    """The shares (V,) of its edge that a vertex may lie between: farther from a voxel between two of the other sign."""
     steps = np.eye(3, dtype=int)[axis]
     before, here, there, after = (
         psi[tuple(np.clip(low + k * steps, 0, np.array(psi.shape) - 1).T)] for k in (-1, 0, 1, 2)

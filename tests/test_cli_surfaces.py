@@ -64,7 +64,7 @@ def test_mesh_in_mesh_out(folder):
     out, expected = values(Path("o.func.gii")), denoise(MESH, NOISY, flow="l2", iterations=10).data
     assert np.abs(out - expected).max() < 1e-4 * np.ptp(NOISY)
     error, before = (np.sqrt(np.mean((x - 10 * HEIGHT) ** 2)) for x in (out, NOISY))
-    assert error < 0.3 * before
+    assert error < 0.5 * before
     vertices, triangles = (array.data for array in nib.load("o.surf.gii").darrays)
     assert np.allclose(vertices, MESH.vertices_ras_mm, atol=1e-5) and np.array_equal(triangles, MESH.cells)
     written = record(Path("o.func.json"))
@@ -231,7 +231,7 @@ def test_vertices_beyond_the_band_are_told(folder):
     assert run.code == 0 and 50 < lost < 600 and f"{lost} of 642 vertices" in run.err
     write_mesh(folder / "off.surf.gii", icosphere(RADIUS, centre=CENTRE + 100))
     message = refused(
-        "denoise", "psi.nii.gz", "data.nii.gz", "-o", "q.nii.gz", "--on", "off.surf.gii=q.func.gii", *L2, code=1
+        "denoise", "psi.nii.gz", "data.nii.gz", "-o", "q.nii.gz", "--on", "off.surf.gii=off.func.gii", *L2, code=1
     )
     assert "none of the 642 vertices" in message and "--frame" in message
     message = refused("denoise", "off.surf.gii", "data.nii.gz", "-o", "q.nii.gz", *L2, code=1)
@@ -272,6 +272,7 @@ def test_coordinates_that_the_file_does_not_tell(folder):
         (("lh.surf.gii", "lh.map", "-o", "o.func.gii", "--weights", "data.nii.gz"), ("data.nii.gz", "642")),
         (("lh.surf.gii", "lh.map", "-o", "o.func.gii", "--on", "lh.white"), ("SURFACE=FILE",)),
         (("lh.surf.gii", "lh.map", "-o", "o.func.gii", "--on", "lh.white=o.func.gii"), ("o.func.gii", "two outputs")),
+        (("psi.nii.gz", "data.nii.gz", "-o", "o.nii.gz", "--on", "lh.white=o.func.gii"), ("o.func.gii", "--no-mesh")),
         (("lh.surf.gii", "lh.map", "-o", "o.func.gii", "--on", "lh.gone=p.func.gii"), ("lh.gone", "no such file")),
         (("lh.surf.gii", "lh.map", "-o", "lh.map"), ("lh.map", "input")),
         (("lh.surf.gii", "data.nii.gz", "-o", "o.nii.gz", "--map", "2"), ("map", "volume")),

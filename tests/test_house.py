@@ -29,7 +29,10 @@ def imported_packages(folder: str) -> set[str]:
             elif isinstance(node, ast.ImportFrom) and node.module:
                 names.add(node.module.split(".")[0])
     own = {"beltrami_cli"} | {file.stem for file in (ROOT / folder).glob("*.py")}
-    return {{"skimage": "scikit-image", "igl": "libigl"}.get(name, name) for name in names - set(sys.stdlib_module_names) - own}
+    return {
+        {"skimage": "scikit-image", "igl": "libigl"}.get(name, name)
+        for name in names - set(sys.stdlib_module_names) - own
+    }
 
 
 def names_of(requirements: list[str]) -> set[str]:

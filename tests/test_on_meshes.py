@@ -93,8 +93,8 @@ def test_refined():
     mesh, d = sphere(2)
     grid = Grid.from_spacing((60, 60, 60))
     fine = refined(mesh, grid)
-    assert [len(edges) for edges in fine.edges] == [480, 1920, 7680][: len(fine.edges)] and len(fine.edges) == 2
-    assert np.allclose(fine.surface.points[: len(d)], mesh.vertices_ras_mm) and len(fine.surface.cells) == 16 * 320
+    assert [len(edges) for edges in fine.edges] == [480, 1920, 7680]  # to edges of 0.75 mm
+    assert np.allclose(fine.surface.points[: len(d)], mesh.vertices_ras_mm) and len(fine.surface.cells) == 64 * 320
     linear = np.stack([mesh.vertices_ras_mm @ [1, 2, 3], mesh.vertices_ras_mm @ [0, -1, 0.5]])
     values, trust = fine.carry(linear, np.ones(len(d)))
     assert np.allclose(values[0], fine.surface.points @ [1, 2, 3]) and (trust == 1).all()
@@ -141,7 +141,7 @@ def test_inside_out(run):
 def test_place_in_space(run):
     """The grid moves with the mesh, but does not turn: white noise, whose detail is a voxel's, shows that."""
     mesh, d, data, result = run
-    moved = Mesh(mesh.vertices_ras_mm + [100.3, -20, 7], mesh.cells)
+    moved = Mesh(mesh.vertices_ras_mm + np.array([100.3, -20, 7]), mesh.cells)
     assert apart(denoise(moved, data, **RUN).data, result.data) <= 1e-4 * np.ptp(data)
     smooth = 100 * d[:, 2] * d[:, 0]
     expected = denoise(mesh, smooth, **RUN).data
@@ -220,7 +220,7 @@ def test_turning_all_angles_commutes():
     angles = (np.degrees(np.arctan2(d[:, 1], d[:, 0])) + 40 * rng.normal(size=len(d))) % 360
     options = {"kind": "circular", "period": 360, "beta": 0.05, "iterations": 20, "precision": "float64"}
     first = denoise(mesh, angles, **options).data
-    assert 0 <= first.min() and first.max() < 360
+    assert first.min() >= 0 and first.max() < 360
     for turn in (90, 77.7):
         second = denoise(mesh, (angles + turn) % 360, **options).data
         assert np.abs((second - first - turn + 180) % 360 - 180).max() <= 1e-9
@@ -310,7 +310,7 @@ def test_weights_say_who_is_heard():
 
 def test_lone_vertices_get_no_value():
     mesh, d = sphere(3)
-    lone = np.concatenate([mesh.vertices_ras_mm, [CENTRE, CENTRE + [0, 0, RADIUS]]])
+    lone = np.concatenate([mesh.vertices_ras_mm, [CENTRE, CENTRE + RADIUS * np.eye(3)[2]]])
     for theirs in (1e6, np.nan):
         result = denoise(Mesh(lone, mesh.cells), np.r_[100 * d[:, 2], theirs, theirs], beta=0.01, iterations=5)
         assert np.flatnonzero(np.isnan(result.data)).tolist() == [len(d), len(d) + 1]
@@ -383,24 +383,25 @@ def psnr(values: np.ndarray, d: np.ndarray) -> float:
 @pytest.mark.parametrize("sigma", [20.0, 40.0])
 def test_automatic_choice(sigma):
     """Against the best of all betas and iterations."""
-    mesh, d = sphere(5)
+    mesh, d = sphere(4)
     data = noisy(d, sigma)
     result = denoise(mesh, data, stop="auto")
     assert result.warnings == ()
     assert result.record["Noise"]["sd"][0] == pytest.approx(sigma, rel=0.05)
-    best = max(
-        psnr(denoise(mesh, data, beta=beta, iterations=iterations).data, d)
-        for beta in (0.02, 0.04, 0.08, 0.16)
-        for iterations in (4, 8, 16, 32, 64)
-    )
-    assert psnr(result.data, d) >= best - 0.3
+    curves = [searched(mesh, d, data, beta) for beta in (0.04, 0.08, 0.16, 0.32)]
+    assert psnr(result.data, d) >= max(map(max, curves)) - 0.3
+
+
+def searched(mesh: Mesh, d: np.ndarray, data: np.ndarray, beta: float) -> list[float]:
+    """PSNR after 2, 4, 8 ... 64 iterations."""
+    return [psnr(denoise(mesh, data, beta=beta, iterations=2**k).data, d) for k in range(1, 7)]
 
 
 def test_beta_is_chosen_for_the_iterations_given():
     mesh, d = sphere(4)
-    result = denoise(mesh, noisy(d, 40), iterations=20)
-    betas = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
-    best = max(psnr(denoise(mesh, noisy(d, 40), beta=beta, iterations=20).data, d) for beta in betas)
+    data = noisy(d, 40)
+    result = denoise(mesh, data, iterations=20)
+    best = max(psnr(denoise(mesh, data, beta=beta, iterations=20).data, d) for beta in (0.02, 0.04, 0.08, 0.16, 0.32))
     assert psnr(result.data, d) >= best - 0.5
 
 
@@ -455,14 +456,15 @@ def test_on_kinds():
     mesh, d = sphere(2)
     angles = np.degrees(np.arctan2(d[:, 1], d[:, 0]))
     on = denoise(mesh, angles, kind="circular", period=360, iterations=2, beta=0.0, on=[mesh]).on[0]
-    assert -180 <= on.min() and on.max() < 180
-    assert denoise(mesh, d + 0j, kind="vector", iterations=2, on=[mesh], independent=True).on[0].shape == (162, 3)
-    assert denoise(mesh, d, kind="vector", iterations=2, on=[mesh]).on[0].shape == (162, 3)
+    assert on.min() >= -180 and on.max() < 180
+    options = {"kind": "vector", "iterations": 2, "beta": 1.0, "on": [mesh]}
+    assert denoise(mesh, d, **options).on[0].shape == denoise(mesh, d, independent=True, **options).on[0].shape
+    assert denoise(mesh, d[:, 0] + 1j * d[:, 1], **options).on[0].shape == (162, 2)
 
 
 def test_on_a_mesh_that_is_partly_elsewhere():
     mesh, d = sphere(3)
-    moved = Mesh(mesh.vertices_ras_mm + [14, 0, 0], mesh.cells)
+    moved = Mesh(mesh.vertices_ras_mm + np.array([14, 0, 0]), mesh.cells)
     result = denoise(mesh, 100 * d[:, 2], flow="l2", iterations=2, on=[moved])
     off = np.abs(np.linalg.norm(moved.vertices_ras_mm - CENTRE, axis=1) - RADIUS)
     width = result.record["Band"]["half_width_mm"]
@@ -552,17 +554,17 @@ def test_refused(data, options, says):
 )
 def test_no_mesh(mesh):
     """As LEVELSET, and as a mesh to give values to."""
-    with pytest.raises((DataError, RefusedError), match="triangle|vertex|vertices"):
+    with pytest.raises((DataError, RefusedError), match=r"triangle|vertex|vertices"):
         denoise(mesh, AT[:, 2], beta=1.0, iterations=1)
     if len(mesh.cells) and mesh.vertices_ras_mm.any():
-        with pytest.raises((DataError, RefusedError), match="triangle|vertex|vertices"):
+        with pytest.raises((DataError, RefusedError), match=r"triangle|vertex|vertices"):
             denoise(BALL, AT[:, 2], beta=1.0, iterations=1, on=[mesh])
 
 
 @pytest.mark.parametrize("levelset", ["lh.white", trimesh.creation.icosphere(1)])
 def test_no_level_set(levelset):
     for data in (AT[:, 2], np.zeros((9, 9, 9))):
-        with pytest.raises(RefusedError, match="levelset: .*expected an array or a Mesh"):
+        with pytest.raises(RefusedError, match=r"levelset: .*expected an array or a Mesh"):
             denoise(levelset, data, beta=1.0, iterations=1)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import click
 
 from beltrami_cli import __version__
-from beltrami_cli.cli.common import INTERRUPTED, TERMINATED, report_error
+from beltrami_cli.cli.common import report_error
 from beltrami_cli.cli.compare import compare
 from beltrami_cli.cli.demo import demo
 from beltrami_cli.cli.denoise import denoise
@@ -18,6 +19,9 @@ from beltrami_cli.cli.levelset import levelset
 from beltrami_cli.cli.mesh import mesh
 from beltrami_cli.cli.phantom import phantom
 from beltrami_cli.cli.sample import sample
+
+# What ends a run, and the exit code that it gives.
+STOPPED = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 EPILOG = """Exit codes: 0 done; 1 the data or the numerics failed, or a comparison is out of tolerance; 2 usage, or
 refused before starting; 130 on Ctrl-C; 143 on SIGTERM.
@@ -37,7 +41,15 @@ for command in (denoise, levelset, mesh, sample, phantom, compare, info, demo):
 
 def main(args: list[str] | None = None) -> int:
     """Run the command line and return its exit code; every failure is one line on stderr."""
-    signal.signal(signal.SIGTERM, _terminate)
+    before = {number: signal.signal(number, _stop) for number in STOPPED}
+    try:
+        return _run(args)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run(args: list[str] | None) -> int:
     try:
         code = beltrami.main(args, prog_name="beltrami", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -48,14 +60,17 @@ def main(args: list[str] | None = None) -> int:
             click.echo(error.ctx.get_usage(), err=True)
         click.echo(f"beltrami: {error.format_message()}", err=True)
         return error.exit_code
-    except (KeyboardInterrupt, click.Abort):
-        click.echo("beltrami: interrupted; nothing was written", err=True)
-        return INTERRUPTED
     except Exception as error:
         # Only what a command could not report itself, before its options were read.
         return report_error(error, verbose=False)
     return code if isinstance(code, int) else 0
 
 
-def _terminate(_signal: int, _frame: Any) -> None:
-    sys.exit(TERMINATED)
+def _stop(number: int, _frame: Any) -> None:
+    """End the process here and now: an exception that meets a compiled function on its way out can crash it."""
+    staging = sys.modules.get("beltrami_cli.formats.staging")  # else nothing is being written
+    if staging is not None:
+        staging.abandon()
+    told = "\nbeltrami: interrupted; nothing was written\n" if number == signal.SIGINT else ""
+    os.write(2, told.encode())
+    os._exit(STOPPED[number])

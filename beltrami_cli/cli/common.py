@@ -9,9 +9,6 @@ import click
 
 from beltrami_cli.errors import BeltramiError
 
-INTERRUPTED = 130
-TERMINATED = 143
-
 
 class Command(click.Command):
     """A subcommand with -q and -v whose failures become one line on stderr and an exit code."""

@@ -10,6 +10,15 @@ from types import TracebackType
 
 from beltrami_cli.errors import DataError, RefusedError
 
+# The hidden folders of stages that are entered.
+_OPEN: set[Path] = set()
+
+
+def abandon() -> None:
+    """Leave no trace of what is being written: for a process that is about to end."""
+    for folder in list(_OPEN):
+        shutil.rmtree(folder, ignore_errors=True)
+
 
 class Stage:
     """Stands between a run and the final names of its outputs.
@@ -39,6 +48,7 @@ class Stage:
         self._clear()
         for folder in self._folders():
             try:
+                _OPEN.add(folder)
                 folder.mkdir()
             except OSError as error:
                 self._clear()
@@ -72,6 +82,7 @@ class Stage:
     def _clear(self) -> None:
         for folder in self._folders():
             shutil.rmtree(folder, ignore_errors=True)
+            _OPEN.discard(folder)
 
     def _folder(self, parent: Path) -> Path:
         # Named after a file that is made there, so that runs which share a folder do not meet in it.

@@ -56,8 +56,8 @@ def mean_curvatures(points, normals, start, ring, across):
 
     With t and h the parts of x_j - x_i along the tangent plane and the normal, H = sum w h with w = c (1 - a . t). The
     tilt a makes sum w t = 0, so that a tilt of the normal is no curvature however uneven the ring, and c makes
-    sum w t^2 = 2. Entries `across` (N,) a border are left out: there, H is the curvature along it. Where the ring is too
-    small, or no such weights are, H and w are 0 and do not count.
+    sum w t^2 = 2. Entries `across` (N,) a border are left out: there, H is the curvature along it. Where the ring is
+    too small, or no such weights are, H and w are 0 and do not count.
     """
     curvature, weight, counted = np.zeros(len(points)), np.zeros(len(ring)), np.zeros(len(points), np.bool_)
     for block in nb.prange((len(points) + BLOCK - 1) // BLOCK):
