@@ -43,6 +43,8 @@ NEAR = 2.5
 OPPOSED = -0.5
 # Below this (60 degrees) they still lead on from outer voxels to where banks touch, as at the mouth of a sulcus.
 SPREAD = 0.5
+# Fewer voxels than these are a dent of the inner boundary, whose sides are opposed too.
+LEAST_MEETING = 12
 # Psi, in voxels, at the least, where two banks touch: enough to be on the outer side.
 KEPT_APART = 0.05
 
@@ -185,7 +187,7 @@ def _meeting(
 
     Two neighbours of the tissue whose nearest inner voxels lie in opposed directions have such a point between them.
     """
-    from scipy.ndimage import binary_propagation, distance_transform_edt
+    from scipy.ndimage import binary_propagation, distance_transform_edt, label
 
     distance, feet = distance_transform_edt(~inner, sampling=spacing, return_indices=True)
     away = (np.indices(inner.shape) - feet) * spacing.reshape(3, 1, 1, 1) / np.maximum(distance, 1e-30)
@@ -207,6 +209,8 @@ def _meeting(
     # A dent of the inner boundary has opposed sides too, but is no sulcus: it does not go on from outer voxels.
     joined = met & binary_propagation(outer & known, mask=path, structure=np.ones((3, 3, 3)))
     joined &= to_outer > distance / 2  # nearer, the outer voxels themselves keep the banks apart
+    parts, _ = label(joined, np.ones((3, 3, 3)))
+    joined &= np.bincount(parts.ravel())[parts] >= LEAST_MEETING
     at = np.concatenate(points)
     nearest = tuple(np.round(at).astype(int).T)
     return joined, at[joined[nearest]]

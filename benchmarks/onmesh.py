@@ -93,9 +93,9 @@ def main() -> None:
     case = vertex_case()
     scored = int(np.isfinite(angle_truth()).sum())
     print(f"noise at the vertices: mean error in degrees at {scored} of them, {case.score(at_vertices()):.2f} before")
-    for options in (AUTO, GIVEN):
-        for label, way in (("vertex data on the mesh", on_mesh), ("painted, Psi, sampled", painted)):
-            report(label, case, way, options)
+    report("vertex data on the mesh", case, on_mesh, AUTO)
+    report("vertex data on the mesh", case, on_mesh, GIVEN)
+    report("painted, Psi, sampled", case, painted, GIVEN)
     if shutil.which("wb_command"):
         score, sigma = smoothed_by_workbench(case)
         print(f"  {'Workbench':26} {score:6.2f}           best sigma, {sigma:g} mm")

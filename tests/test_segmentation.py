@@ -81,23 +81,23 @@ def errors(true: np.ndarray, grid: Grid, margin: int = 0) -> tuple[np.ndarray, n
 
 # At the centre of a tube of 4 voxels, 1 voxel from the axis, normals turn four times as fast as on its surface.
 SHAPES = {
-    **{f"sphere {radius} {at}": (sphere(radius, OFF_GRID[at]), 0, (1, 2)) for radius in (8, 20) for at in range(3)},
-    "sphere on the grid": (sphere(8, (0, 0, 0)), 0, (1, 2)),
-    "anisotropic": (sphere(16, OFF_GRID[0], (0.8, 0.8, 1.28)), 0, (1, 2)),
-    "slices": (sphere(20, OFF_GRID[0], (1.0, 1.0, 3.0)), 0, (1, 3)),
-    "torus": (torus(18, 8, (0.2, 0.3, 1)), 0, (1.5, 4)),
-    "torus along the grid": (torus(18, 8, (0, 0, 1)), 0, (1.5, 6)),
-    "thin torus": (torus(12, 4, (0.2, 0.3, 1)), 0, (3, 6)),
-    "steep plane": (plane((1, 2, 3)), 8, (0.1, 0.2)),
-    "gentle plane": (plane((0, 0.3, 1)), 8, (0.5, 1)),
-    "terraces of ten voxels": (plane((0.1, 0.05, 1)), 8, (0.5, 1)),
+    **{f"sphere {radius} {at}": (sphere, (radius, at), (1, 2)) for radius in (8, 20) for at in OFF_GRID},
+    "sphere on the grid": (sphere, (8, (0, 0, 0)), (1, 2)),
+    "anisotropic": (sphere, (16, OFF_GRID[0], (0.8, 0.8, 1.28)), (1, 2)),
+    "slices": (sphere, (20, OFF_GRID[0], (1.0, 1.0, 3.0)), (1, 3)),
+    "torus": (torus, (18, 8, (0.2, 0.3, 1)), (1.5, 4)),
+    "torus along the grid": (torus, (18, 8, (0, 0, 1)), (1.5, 6)),
+    "thin torus": (torus, (12, 4, (0.2, 0.3, 1)), (3, 6)),
+    "steep plane": (plane, ((1, 2, 3),), (0.1, 0.2)),
+    "gentle plane": (plane, ((0, 0.3, 1),), (0.5, 1)),
+    "terraces of ten voxels": (plane, ((0.1, 0.05, 1),), (0.5, 1)),
 }
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_accuracy_near_the_surface(name):
-    (true, grid), margin, (median, high) = SHAPES[name]
-    off, angle = errors(true, grid, margin)
+    shape, settings, (median, high) = SHAPES[name]
+    off, angle = errors(*shape(*settings), margin=8 if shape is plane else 0)
     assert np.percentile(np.abs(off), 95) <= 0.25 and abs(off.mean()) < 0.05
     assert np.median(angle) <= median and np.percentile(angle, 95) <= high
 
@@ -348,10 +348,10 @@ def test_the_real_rim(shared_data):
     import nibabel
 
     image = nibabel.load(shared_data / "laynii_ding2016" / "Ding2016_occip_rim.nii.gz")
-    part = (slice(40, 100), slice(20, 80), slice(10, 70))
+    part = (slice(40, 84), slice(20, 64), slice(10, 54))
     labels = np.asarray(image.dataobj)[part]
     grid = Grid(labels.shape, np.asarray(image.affine, float))
     mesh = surface_of_labels(labels, grid, labels_inside=None, between=((2,), (1,)))
     white, outer = (surface_of_labels(labels, grid, labels_inside=(k,), between=None) for k in (2, 1))
     away = np.abs(distance(white, mesh.vertices_ras_mm) - distance(outer, mesh.vertices_ras_mm))
-    assert np.percentile(away, 95) < 0.1
+    assert np.percentile(away, 95) < 0.03

@@ -21,7 +21,7 @@ from beltrami_cli.cli.phantom import phantom
 from beltrami_cli.cli.sample import sample
 
 # What ends a run, and the exit code that it gives.
-STOPPED = {signal.SIGINT: 130, signal.SIGTERM: 143}
+STOPPED: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 EPILOG = """Exit codes: 0 done; 1 the data or the numerics failed, or a comparison is out of tolerance; 2 usage, or
 refused before starting; 130 on Ctrl-C; 143 on SIGTERM.

@@ -55,10 +55,10 @@ def sample(
     \b
         beltrami sample denoised.nii.gz lh.midthickness.surf.gii -o lh.denoised.func.gii
     """
-    from beltrami_cli import vertices
+    from beltrami_cli import volume_to_surface
     from beltrami_cli.config import parse_period, parse_spacing
 
-    job = vertices.Sampling(
+    job = volume_to_surface.Sampling(
         volume=volume,
         surface=surface,
         output=output,
@@ -70,7 +70,7 @@ def sample(
         spacing=None if spacing is None else parse_spacing(spacing),
         overwrite=bool(overwrite),
     )
-    record = vertices.sample(job, notify=lambda line: note(quiet, f"warning: {line}"))
+    record = volume_to_surface.sample(job, notify=lambda line: note(quiet, f"warning: {line}"))
     counts = record["Vertices"]
     say(quiet, f"wrote {', '.join(record['Outputs'])}")
     say(
