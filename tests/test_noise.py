@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.ndimage import gaussian_filter, zoom
 from scipy.spatial import cKDTree
 from test_band import band_of
@@ -15,8 +16,16 @@ from beltrami_cli.evolve import Schedule, evolve
 from beltrami_cli.extension import Reextension, extend, own_samples
 from beltrami_cli.flows import Flow, Stepper
 from beltrami_cli.grid import Grid
+from beltrami_cli.kernels.mesh import half_edges
 from beltrami_cli.kinds import Kind
-from beltrami_cli.noise import looks_correlated, noise_sd, smoothness_mm
+from beltrami_cli.noise import (
+    looks_correlated,
+    looks_correlated_on_mesh,
+    noise_sd,
+    noise_sd_on_mesh,
+    smoothness_mm,
+    smoothness_on_mesh,
+)
 
 DEGREES = Kind("circular", period=360.0)
 RADIUS = 14.0
@@ -286,3 +295,91 @@ def test_too_few_samples_say_nothing(scene):
     u = np.random.default_rng(14).normal(size=(96, 80, 1))
     assert not looks_correlated(flat, samples_of(flat, u), Kind())
     assert looks_correlated(flat, samples_of(flat, gaussian_filter(u, (1, 1, 0))), Kind())
+
+
+# --- at the vertices of a mesh ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def mesh_scene():
+    """A sphere's triangles, vertices (V, 3) mm, unit vectors (3, V) from its centre, white noise of unit variance."""
+    sphere = trimesh.creation.icosphere(5)
+    d = np.array(sphere.vertices)
+    return np.array(sphere.faces, np.int32), RADIUS * d, d.T, np.random.default_rng(15).normal(size=len(d))
+
+
+def correlated_on_mesh(cells, points, samples, kind=Kind()):  # noqa: B008
+    return looks_correlated_on_mesh(points, *half_edges(cells, len(points)), samples, kind)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 5.0, 20.0])
+def test_noise_at_vertices(mesh_scene, sigma):
+    cells, _, d, noise = mesh_scene
+    borders = 60 * (np.sin(3 * np.arctan2(d[1], d[0])) > 0)
+    for data in (smooth(d), smooth(d) + borders):
+        found = noise_sd_on_mesh(cells, (data + sigma * noise)[None], Kind())
+        assert found.shape == (1,) and found[0] == pytest.approx(sigma, rel=0.05)
+    missing = np.where(np.random.default_rng(16).random(len(noise)) < 0.3, np.nan, smooth(d) + sigma * noise)
+    assert noise_sd_on_mesh(cells, missing[None], Kind())[0] == pytest.approx(sigma, rel=0.06)
+
+
+@pytest.mark.parametrize("sigma", [5.0, 25.0, 60.0])
+def test_noise_of_angles_at_vertices(mesh_scene, sigma):
+    cells, _, d, noise = mesh_scene
+    data = DEGREES.to_channels((azimuth(d) + sigma * noise) % 360)
+    assert noise_sd_on_mesh(cells, data, DEGREES)[0] == pytest.approx(sigma, rel=0.06)
+
+
+def test_noise_at_vertices_channels_and_untold(mesh_scene):
+    cells, _, d, noise = mesh_scene
+    channels = np.stack([noise, 30 * noise[::-1], np.full_like(noise, 7.0)])
+    assert noise_sd_on_mesh(cells, channels, Kind("vector")) == pytest.approx([1, 30, 0], rel=0.05)
+    assert noise_sd_on_mesh(cells, smooth(d)[None], Kind())[0] < 0.1
+    assert np.isnan(noise_sd_on_mesh(cells[:50], noise[None], Kind())[0])
+    assert np.isnan(noise_sd_on_mesh(cells, np.full((1, len(noise)), np.nan), Kind())[0])
+
+
+def test_width_at_vertices(mesh_scene):
+    """Of white noise none, and of white noise under a Gaussian kernel the kernel's."""
+    cells, points, _, noise = mesh_scene
+    assert smoothness_on_mesh(points, cells, noise[None], Kind()) < 0.35  # edges are 0.5 mm
+    apart, near = cKDTree(points).query(points, k=60)
+    for fwhm in (1.0, 1.6):
+        weights = np.exp(-4 * np.log(2) * apart**2 / fwhm**2)  # a Gaussian kernel of that width
+        blurred = (weights * noise[near]).sum(1) / weights.sum(1)
+        assert smoothness_on_mesh(points, cells, blurred[None], Kind()) == pytest.approx(fwhm, rel=0.1)
+    assert np.isnan(smoothness_on_mesh(points, cells, np.full((1, len(points)), 4.2), Kind()))
+    assert np.isnan(smoothness_on_mesh(points, cells[:20], noise[None], Kind()))
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1.0, 5.0, 20.0, 100.0])
+def test_white_noise_at_vertices_is_not_correlated(mesh_scene, sigma):
+    cells, points, d, noise = mesh_scene
+    pieces = 60.0 * (np.sin(3 * np.arctan2(d[1], d[0])) > 0)
+    for data in (smooth(d), pieces, np.zeros_like(noise)):
+        assert not correlated_on_mesh(cells, points, (data + sigma * noise)[None])
+    angles = DEGREES.to_channels(azimuth(d) + sigma * noise)
+    assert not correlated_on_mesh(cells, points, angles, DEGREES)
+
+
+@pytest.mark.parametrize("sigma", [5.0, 20.0])
+def test_correlated_noise_at_vertices(mesh_scene, sigma):
+    """Interpolated from a mesh of half as many vertices along a line, or blurred by two edges."""
+    cells, points, d, noise = mesh_scene
+    coarse = np.array(trimesh.creation.icosphere(4).vertices)
+    apart, near = cKDTree(coarse).query(d.T, k=2)
+    interpolated = np.where(apart[:, 0] < 1e-6, noise[near[:, 0]], noise[near].mean(1))
+    apart, near = cKDTree(points).query(points, k=40)
+    weights = np.exp(-4 * np.log(2) * (apart / 1.0) ** 2)
+    blurred = (weights * noise[near]).sum(1)
+    for data in (interpolated, blurred):
+        assert correlated_on_mesh(cells, points, (smooth(d) + sigma * data / data.std())[None])
+        angles = DEGREES.to_channels(azimuth(d) + sigma * data / data.std())
+        assert correlated_on_mesh(cells, points, angles, DEGREES)
+
+
+def test_too_few_vertices_say_nothing(mesh_scene):
+    cells, points, _, noise = mesh_scene
+    few = np.where(np.arange(len(noise)) < 60, noise, np.nan)
+    for samples in (few, np.full_like(noise, np.nan)):
+        assert not correlated_on_mesh(cells, points, samples[None])

@@ -278,35 +278,42 @@ def faces_around(cells, vertices):
 
 
 @nb.njit(cache=True)
+def along_segment(p, a, b):
+    """Where on the segment from a (0) to b (1) the point nearest to p is, and its squared distance."""
+    dot, size, apart = 0.0, 0.0, 0.0
+    for k in range(3):
+        dot += (p[k] - a[k]) * (b[k] - a[k])
+        size += (b[k] - a[k]) ** 2
+    t = min(max(dot / size, 0.0), 1.0) if size > 0 else 0.0
+    for k in range(3):
+        apart += (p[k] - a[k] - t * (b[k] - a[k])) ** 2
+    return t, apart
+
+
+@nb.njit(cache=True)
 def barycentric(p, a, b, c, w):
     """Weights w (3,) of the corners for the point of triangle abc nearest to p; returns its squared distance."""
-    # By the regions of Ericson, Real-Time Collision Detection (2005), Sec. 5.1.5.
-    ab0, ab1, ab2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    ac0, ac1, ac2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    ap0, ap1, ap2 = p[0] - a[0], p[1] - a[1], p[2] - a[2]
-    d1, d2 = ab0 * ap0 + ab1 * ap1 + ab2 * ap2, ac0 * ap0 + ac1 * ap1 + ac2 * ap2
-    bb, bc, cc = ab0 * ab0 + ab1 * ab1 + ab2 * ab2, ab0 * ac0 + ab1 * ac1 + ab2 * ac2, ac0 * ac0 + ac1 * ac1 + ac2 * ac2
-    d3, d4, d5, d6 = d1 - bb, d2 - bc, d1 - bc, d2 - cc
-    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
-    if d1 <= 0 and d2 <= 0:
-        v, t = 0.0, 0.0
-    elif d3 >= 0 and d4 <= d3:
-        v, t = 1.0, 0.0
-    elif d6 >= 0 and d5 <= d6:
-        v, t = 0.0, 1.0
-    elif vc <= 0 and d1 >= 0 and d3 <= 0:
-        v, t = (d1 / (d1 - d3) if d1 > d3 else 0.0), 0.0
-    elif vb <= 0 and d2 >= 0 and d6 <= 0:
-        v, t = 0.0, (d2 / (d2 - d6) if d2 > d6 else 0.0)
-    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
-        total = (d4 - d3) + (d5 - d6)
-        t = (d4 - d3) / total if total > 0 else 0.0
-        v = 1 - t
-    else:
-        v, t = vb / (va + vb + vc), vc / (va + vb + vc)
-    w[0], w[1], w[2] = 1 - v - t, v, t
-    q0, q1, q2 = ap0 - v * ab0 - t * ac0, ap1 - v * ab1 - t * ac1, ap2 - v * ab2 - t * ac2
-    return q0 * q0 + q1 * q1 + q2 * q2
+    bb = bc = cc = pb = pc = 0.0
+    for k in range(3):
+        x, y, z = b[k] - a[k], c[k] - a[k], p[k] - a[k]
+        bb, bc, cc, pb, pc = bb + x * x, bc + x * y, cc + y * y, pb + x * z, pc + y * z
+    area = bb * cc - bc * bc
+    if area > 1e-12 * bb * cc:  # else a line, or a point
+        v, t = (cc * pb - bc * pc) / area, (bb * pc - bc * pb) / area
+        if v >= 0 and t >= 0 and v + t <= 1:
+            w[0], w[1], w[2] = 1 - v - t, v, t
+            apart = 0.0
+            for k in range(3):
+                apart += (p[k] - a[k] - v * (b[k] - a[k]) - t * (c[k] - a[k])) ** 2
+            return apart
+    best = np.inf
+    corners = (a, b, c)
+    for k in range(3):
+        t, apart = along_segment(p, corners[k], corners[(k + 1) % 3])
+        if apart < best:
+            best = apart
+            w[k], w[(k + 1) % 3], w[(k + 2) % 3] = 1 - t, t, 0.0
+    return best
 
 
 @nb.njit(cache=True, parallel=True)
