@@ -90,7 +90,8 @@ def denoise(
             on_grid(None if mask is None else _filled_with_nan(mask), "mask"),
             at_vertices=at_vertices, on=on,
         )  # fmt: skip
-        solved = solver.denoise_series(placed) if settings.independent else solver.denoise(placed, observer)
+        work = solver.denoise_series if settings.independent else solver.denoise
+        solved = work(placed, observer)
     finally:
         numba.set_num_threads(threads)  # the caller's own choice
     return replace(

@@ -5,12 +5,11 @@ Distances, winding numbers and pseudonormals are libigl's (of which only the par
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
 
-from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.errors import DataError
 from beltrami_cli.grid import Grid
 from beltrami_cli.repair import Repaired, edges, repaired
 from beltrami_cli.surface import Mesh
@@ -24,8 +23,6 @@ BESIDE, ROUNDING = 1e-4, 1e-4
 # A grid of its own has so many voxels between opposite banks, which then do not leak, but for the nearest few percent.
 VOXELS_BETWEEN_BANKS, NEAREST_BANKS = 2.0, 5
 BANKS_SAMPLE = 4000  # triangles that are asked how far the bank across is
-# Such a grid has at most this many voxels: 1 GB as float32.
-MOST_VOXELS = 2**28
 AT_ONCE = 2_000_000  # voxels asked in one call: 0.3 GB
 
 
@@ -66,22 +63,12 @@ def own_grid(mesh: Mesh, spacing: float | None = None, margin: float | None = No
         takes `VOXELS_BETWEEN_BANKS` voxels between opposite banks.
     margin: mm beyond the vertices on every side; by default the half-width of `signed_distance` and one voxel more.
 
-    Raises RefusedError where that takes more than `MOST_VOXELS` voxels, DataError for a mesh without triangles.
+    Raises RefusedError as `Grid.around`, DataError for a mesh without triangles.
     """
     surface = repaired(mesh)
     step = _resolution(surface) if spacing is None else spacing
     around = (HALF_WIDTH + 1) * step if margin is None else margin
-    used = surface.vertices[np.unique(surface.cells)]
-    low, high = used.min(0) - around, used.max(0) + around
-    nx, ny, nz = (int(n) for n in np.ceil((high - low) / step) + 1)
-    if math.prod((nx, ny, nz)) > MOST_VOXELS:
-        raise RefusedError(
-            f"a grid around the surface takes {nx} x {ny} x {nz} voxels of {step:.4g} mm; expected at most "
-            f"{MOST_VOXELS} voxels: give a larger --spacing, or the grid of a volume with --like"
-        )
-    affine = np.diag([step, step, step, 1.0])
-    affine[:3, 3] = (low + high - step * (np.array([nx, ny, nz]) - 1)) / 2
-    return Grid((nx, ny, nz), affine)
+    return Grid.around(surface.vertices[np.unique(surface.cells)], step, around)
 
 
 class _Closed:

@@ -18,6 +18,9 @@ CORNER_TOLERANCE = 1e-3
 # Axes count as orthogonal up to this cosine between them (0.06 degrees: rounding in stored quaternions).
 SHEAR_TOLERANCE = 1e-3
 
+# Around a surface: 1 GB as float32, or a hemisphere at 0.2 mm.
+MOST_VOXELS = 2**28
+
 
 @dataclass(frozen=True, eq=False)
 class Grid:
@@ -45,6 +48,25 @@ class Grid:
         edges = np.ones(3)
         edges[: len(spacing) if isinstance(spacing, tuple) else 3] = spacing
         return Grid((nx, ny, nz), np.diag([*edges, 1.0]))
+
+    @staticmethod
+    def around(ras_mm: np.ndarray, spacing: float, margin: float) -> Grid:
+        """Cubic voxels along R, A and S around points (N, 3), with a margin in mm on every side.
+
+        Raises RefusedError for more than MOST_VOXELS of them.
+        """
+        low, high = ras_mm.min(0) - margin, ras_mm.max(0) + margin
+        counts = np.ceil((high - low) / spacing) + 1
+        if counts.prod() > MOST_VOXELS:
+            size = " x ".join(f"{x:.4g}" for x in np.ptp(ras_mm, axis=0))
+            raise RefusedError(
+                f"spacing: found voxels of {spacing:.4g} mm around a surface of {size} mm, {counts.prod():.3g} of them; "
+                f"expected at most {MOST_VOXELS:.3g}: give a larger --spacing (is the surface in mm?)"
+            )
+        a, b, c = map(int, counts)
+        affine = np.diag([spacing, spacing, spacing, 1.0])
+        affine[:3, 3] = (low + high - spacing * (counts - 1)) / 2
+        return Grid((a, b, c), affine)
 
     @property
     def spacing(self) -> np.ndarray:

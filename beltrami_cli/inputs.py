@@ -17,7 +17,6 @@ from beltrami_cli.surface import Mesh
 
 # Weights below 0 by no more than this share of the largest are rounding and interpolation.
 NEGATIVE_SHARE = 1e-3
-MOST_VOXELS = 2e8  # in the box around a mesh, which costs 8 bytes for each: a hemisphere at 0.2 mm
 
 
 def require_usable(grid: Grid, name: str) -> None:
@@ -46,7 +45,7 @@ def grid_around(mesh: Mesh, settings: Settings, spacing: float | None = None) ->
     """A grid of cubes that holds the band around a mesh, axes as those of RAS.
 
     spacing: mm; by default the mesh's median edge: as many voxels as vertices, which hold all that values there say.
-    Raises RefusedError where that makes more than MOST_VOXELS of them, DataError where the mesh has no edge.
+    Raises RefusedError as `Grid.around`, DataError where the mesh has no edge.
     """
     ras_mm, ends = mesh.vertices_ras_mm[np.unique(mesh.cells)], mesh.cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     lengths = np.linalg.norm(np.subtract(*np.moveaxis(mesh.vertices_ras_mm[ends], 1, 0)), axis=1)
@@ -54,18 +53,7 @@ def grid_around(mesh: Mesh, settings: Settings, spacing: float | None = None) ->
     if not len(lengths):
         raise DataError("the surface has no triangle of any area: is it a mesh at all?")
     h = float(np.median(lengths)) if spacing is None else spacing
-    margin = settings.half_width(np.full(3, h)) + h
-    low, extent = ras_mm.min(0) - margin, np.ptp(ras_mm, axis=0) + 2 * margin
-    shape = np.ceil(extent / h).astype(np.int64) + 1
-    if shape.astype(float).prod() > MOST_VOXELS:
-        raise RefusedError(
-            f"spacing: found voxels of {h:.4g} mm for a surface of {' x '.join(f'{x:.4g}' for x in extent)} mm, "
-            f"which makes {shape.astype(float).prod():.3g} of them; expected at most {MOST_VOXELS:.0e}: give a larger "
-            "--spacing"
-        )
-    affine = np.diag([h, h, h, 1.0])
-    affine[:3, 3] = low
-    return Grid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+    return Grid.around(ras_mm, h, settings.half_width(np.full(3, h)) + h)
 
 
 class Warnings:

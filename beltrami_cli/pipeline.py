@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from beltrami_cli.grid import Canonical, Grid, Volume, require_same_grid, with_c
 from beltrami_cli.inputs import Warnings, band_of, grid_around, require_usable, time_step, without
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.progress import Phases
-from beltrami_cli.record import sha256, sidecar
+from beltrami_cli.record import sha256, sidecar, sidecar_of, write_record
 from beltrami_cli.resample import resample
 from beltrami_cli.sampling import surface_mesh
 from beltrami_cli.solver import Gathered, Result, Solver
@@ -41,7 +40,7 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
     with phases("read"):
         scene = _survey(job)
     files = _Files(job, scene)
-    sources = [file for path in job.all_inputs for file in _files_of(path)]
+    sources = [file for path in job.all_inputs for file in formats.input_files(path)]
     with formats.Stage(files.all, overwrite=job.overwrite, inputs=sources) as stage:
         with phases("numba"):
             kernels.wake()
@@ -61,7 +60,7 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
             for (_, path), mesh, values in zip(job.on, scene.on, solved.on, strict=True):
                 formats.write_overlay(stage.path(path), values, structure=scene.structure_of(mesh))
         record = sidecar(job, sources, files.all, hashes, solved.record, tuple(warnings.lines), phases.seconds)
-        stage.path(files.sidecar).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_record(stage.path(files.sidecar), record)
         stage.commit()
     return replace(solved, record=record, warnings=tuple(warnings.lines))
 
@@ -165,7 +164,8 @@ def _denoise_vertices(
     solver = Solver(
         scene.surface, scene.grid, job.settings, phases, warnings, weights, mask, at_vertices=True, on=scene.on
     )
-    solved = solver.denoise_series(data) if job.settings.independent else solver.denoise(data, observer)
+    work = solver.denoise_series if job.settings.independent else solver.denoise
+    solved = work(data, observer)
     with phases("write"):
         structure = scene.structure_of(scene.surface)
         formats.write_overlay(stage.path(job.volume), solved.data, structure=structure, dtype=dtype)
@@ -257,8 +257,7 @@ class _Files:
                 raise RefusedError(
                     f"on: {file} is also where the values of the mesh beside OUT go; give another name, or --no-mesh"
                 )
-        stem = formats.stem(job.volume)
-        self.sidecar = stem.with_name(stem.name + ".json")
+        self.sidecar = sidecar_of(job.volume)
         self.all = [*files_of(job.volume), *filled, *written, *on, self.sidecar]
 
     def held_by(self, path: Path, mesh: Mesh) -> Mesh:
@@ -269,11 +268,6 @@ class _Files:
 def _values_are(out: Path, mesh: Path) -> bool:
     """True where `out` is the file that a mesh's values are written to."""
     return out in formats.mesh_files(mesh)
-
-
-def _files_of(path: Path) -> list[Path]:
-    """Every file that is read for an input."""
-    return [path] if formats.is_surface(path) or formats.is_overlay(path) else formats.input_files(path)
 
 
 def _survey(job: Job) -> _Scene:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import sys
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from beltrami_cli import __version__
+from beltrami_cli import __version__, formats
 from beltrami_cli.band import Band
 from beltrami_cli.config import Job, Settings
 from beltrami_cli.evolve import Evolution
@@ -157,28 +159,53 @@ def sidecar(
     warnings: tuple[str, ...],
     seconds: dict[str, float],
 ) -> dict[str, Any]:
-    """The record of a run on files, with names as in BIDS derivatives."""
+    """The record of a run on files."""
+    roles = [("levelset", job.levelset), ("data", job.data), ("weights", job.weights), ("mask", job.mask)]
+    roles += [("on", surface) for surface, _ in job.on]
+    role_of = {file: role for role, file in reversed(roles)}
+    read = [(path, digest, role_of.get(path)) for path, digest in zip(sources, hashes, strict=True)]
+    parameters = {**happened["Parameters"], **{name: getattr(job, name) for name in OF_FILES}}
     return {
-        "GeneratedBy": [{"Name": "beltrami_cli", "Version": __version__}],
-        "Sources": [
-            {"Path": os.fspath(path), "SHA256": digest, **_role(job, path)}
-            for path, digest in zip(sources, hashes, strict=True)
-        ],
-        "Outputs": [os.fspath(file) for file in files],
-        "Created": datetime.now(UTC).isoformat(timespec="seconds"),
-        **happened,
-        "Parameters": {**happened["Parameters"], **{name: getattr(job, name) for name in OF_FILES}},
-        "Warnings": list(warnings),
+        **provenance(read, files, parameters, warnings),
+        **{name: value for name, value in happened.items() if name != "Parameters"},
         "Seconds": {name: round(spent, 3) for name, spent in seconds.items()},
         "PeakMemoryMiB": _peak_memory_mib(),
     }
 
 
-def _role(job: Job, path: Path) -> dict[str, str]:
-    """What a source was to the run; nothing for the second file of a pair."""
-    roles = [("levelset", job.levelset), ("data", job.data), ("weights", job.weights), ("mask", job.mask)]
-    roles += [("on", surface) for surface, _ in job.on]
-    return next(({"Role": role} for role, file in roles if file == path), {})
+def provenance(
+    sources: Iterable[tuple[Path, str, str | None]],
+    outputs: Iterable[Path],
+    parameters: Mapping[str, Any],
+    warnings: Iterable[str],
+) -> dict[str, Any]:
+    """What every sidecar says, with names as in BIDS derivatives.
+
+    sources: files, their SHA-256, and what each was to the run; None for the second file of a pair.
+    """
+    return {
+        "GeneratedBy": [{"Name": "beltrami_cli", "Version": __version__}],
+        "Sources": [
+            {"Path": os.fspath(path), "SHA256": digest} | ({"Role": role} if role else {})
+            for path, digest, role in sources
+        ],
+        "Outputs": [os.fspath(file) for file in outputs],
+        "Created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "Parameters": dict(parameters),
+        "Warnings": list(warnings),
+    }
+
+
+def sidecar_of(output: Path) -> Path:
+    """Where the record of an output goes: o.nii.gz -> o.json, o.func.gii -> o.func.json."""
+    stem = formats.stem(output)
+    return stem.with_name(stem.name + ".json")
+
+
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a sidecar: JSON without NaN and infinity; raises DataError where the file cannot be written."""
+    with formats.writing(path):
+        path.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def sha256(path: Path) -> str:

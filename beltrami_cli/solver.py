@@ -158,11 +158,11 @@ class Solver:
         sample = self._sample(data, self.warnings)
         return self._run(data, sample, self.planner.plan(sample), self.warnings, observer)
 
-    def denoise_series(self, data: np.ndarray) -> Result:
+    def denoise_series(self, data: np.ndarray, observer: Observer | None = None) -> Result:
         """Denoise every frame of data, one channel's shape + (K,), on its own."""
         record: dict[str, Any] = {}
         gathered, frames = Gathered(), []
-        for result in self.denoise_frames(data.shape[-1], lambda t: data[..., t], record):
+        for result in self.denoise_frames(data.shape[-1], lambda t: data[..., t], record, observer):
             gathered.add(result)
             frames.append(result.data)
         return gathered.result(np.stack(frames, -1), record)

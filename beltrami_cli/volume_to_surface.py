@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from beltrami_cli import __version__, formats
+from beltrami_cli import formats
 from beltrami_cli.config import Settings
 from beltrami_cli.errors import DataError
 from beltrami_cli.grid import Grid, Volume
 from beltrami_cli.inputs import Warnings, without
 from beltrami_cli.kinds import kind_of
-from beltrami_cli.record import sha256
+from beltrami_cli.record import provenance, sha256, sidecar_of, write_record
 from beltrami_cli.resample import at_points
 from beltrami_cli.surface import Mesh
 
@@ -49,8 +46,7 @@ class Sampling:
 
     @property
     def sidecar(self) -> Path:
-        name = formats.stem(self.output)
-        return name.with_name(name.name + ".json")
+        return sidecar_of(self.output)
 
     @property
     def sources(self) -> dict[Path, str]:
@@ -81,7 +77,7 @@ def sample(job: Sampling, *, notify: Callable[[str], None] | None = None) -> dic
         structure = structure or mesh.structure
         formats.write_overlay(stage.path(job.output), values, structure=structure)
         record = _record(job, files, structure, volume.grid, counts, warnings)
-        stage.path(job.sidecar).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_record(stage.path(job.sidecar), record)
         stage.commit()
     return record
 
@@ -130,22 +126,11 @@ def _record(
     job: Sampling, files: list[Path], structure: str | None, grid: Grid, counts: dict[str, int], warnings: Warnings
 ) -> dict[str, Any]:
     """The sidecar, with names as in that of `denoise`."""
+    names = ("kind", "period", "missing", "frame", "spacing")
+    parameters = {name: getattr(job, name) for name in names} | {"structure": structure}
+    sources = [(path, sha256(path), role) for path, role in job.sources.items()]
     return {
-        "GeneratedBy": [{"Name": "beltrami_cli", "Version": __version__}],
-        "Sources": [
-            {"Path": os.fspath(path), "SHA256": sha256(path), "Role": role} for path, role in job.sources.items()
-        ],
-        "Outputs": [os.fspath(file) for file in files],
-        "Created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "Parameters": {
-            "kind": job.kind,
-            "period": job.period,
-            "missing": job.missing,
-            "frame": job.frame,
-            "structure": structure,
-            "spacing": job.spacing,
-        },
+        **provenance(sources, files, parameters, warnings.lines),
         "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
         "Vertices": counts,
-        "Warnings": list(warnings.lines),
     }

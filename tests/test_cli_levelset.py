@@ -3,7 +3,7 @@
 import nibabel as nib
 import numpy as np
 import pytest
-from command import ball, beltrami, contents, done, load, nifti, refused
+from command import ball, beltrami, contents, done, load, nifti, record, refused
 
 from beltrami_cli import formats
 
@@ -44,7 +44,10 @@ def test_mesh_on_a_grid_of_its_own(tmp_path, mesh):
     assert psi.dtype == np.float32
     assert np.abs(psi - np.clip(true_on(tmp_path / "psi.nii.gz"), -4.8, 4.8)).max() < 0.01
     wrote, grid = run.out.splitlines()
-    assert wrote == f"wrote {tmp_path / 'psi.nii.gz'}"
+    assert wrote == f"wrote {tmp_path / 'psi.nii.gz'}, {tmp_path / 'psi.json'}"
+    told = record(tmp_path / "psi.json")
+    assert [source["Role"] for source in told["Sources"]] == ["source"]
+    assert set(told["Parameters"]) == {"labels", "between", "spacing", "margin", "frame"}
     n = " x ".join(map(str, psi.shape))
     assert grid.startswith(f"{n} voxels of 0.8 x 0.8 x 0.8 mm, affine [")
     assert grid.endswith(f": {(psi < 0).mean():.1%} of the voxels inside")

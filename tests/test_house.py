@@ -13,7 +13,7 @@ import beltrami_cli
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-HEAVY = {"SimpleITK", "matplotlib", "nibabel", "numba", "scipy", "skimage", "tqdm", "trimesh"}
+HEAVY = {"SimpleITK", "igl", "matplotlib", "meshio", "nibabel", "numba", "scipy", "skimage", "tqdm", "trimesh"}
 
 
 def run(*arguments: str) -> str:

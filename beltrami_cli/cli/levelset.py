@@ -49,6 +49,8 @@ def levelset(
 ) -> int:
     """Write the signed distance in mm to the surface of SOURCE, negative inside: exact near it, constant far away.
 
+    Beside PSI goes a JSON record.
+
     SOURCE is a segmentation (a mask, or labels with --labels or --between; the surface is smooth, not a staircase), a
     surface (.surf.gii .ply .obj .stl .vtk, FreeSurfer's lh.white), or a level set to be measured anew. PSI lies on the
     grid of SOURCE, or around it if that is a surface; beyond the border of an open surface it is NaN.
@@ -63,13 +65,14 @@ def levelset(
 
     from beltrami_cli import formats, sources
     from beltrami_cli.config import parse_spacing
+    from beltrami_cli.record import provenance, sha256, sidecar_of, write_record
 
     if margin is not None and not margin >= 0:
         raise click.UsageError(f"--margin: found {margin:g}; expected 0 mm or more")
     steps = parse_spacing(spacing) if spacing else None
     read = [path for path in (source, like) if path]
-    files = formats.volume_files(output)
-    inputs = [file for path in read for file in ([path] if formats.is_surface(path) else formats.input_files(path))]
+    files = [*formats.volume_files(output), sidecar_of(output)]
+    inputs = [file for path in read for file in formats.input_files(path)]
     with formats.Stage(files, overwrite=bool(overwrite), inputs=inputs) as stage:
         announce_compilation(quiet)
         made = sources.read_levelset(
@@ -78,6 +81,10 @@ def levelset(
         for line in made.notes:
             note(quiet, line)
         formats.write_volume(stage.path(output), made.volume)
+        roles = {source: "source", like: "like"}
+        used = {"labels": labels, "between": between, "spacing": steps, "margin": margin, "frame": frame}
+        told = provenance([(path, sha256(path), roles.get(path)) for path in inputs], files, used, made.notes)
+        write_record(stage.path(files[-1]), told)
         stage.commit()
     psi, step = made.volume, made.volume.grid.spacing
     if formats.volume_format(output) == "NPY" and not np.allclose(step, 1):

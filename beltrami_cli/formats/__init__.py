@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike
 
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.formats import checks, freesurfer, gifti, metaimage, mgh, nifti, npy, plain_mesh, png
+from beltrami_cli.formats.checks import writing
 from beltrami_cli.formats.overlays import (
     is_overlay,
     overlay_files,
@@ -59,6 +60,7 @@ __all__ = [
     "write_overlay",
     "write_series",
     "write_volume",
+    "writing",
 ]
 
 _VOLUMES = {
@@ -158,8 +160,10 @@ def open_series(
 
 
 def input_files(path: Path) -> list[Path]:
-    """Every file that `read_volume` reads for this path: both of a pair of header and voxels."""
+    """Every file that is read for this path: both of a pair of header and voxels; a surface or vertex data alone."""
     path = Path(path)
+    if is_surface(path) or is_overlay(path):
+        return [path]
     match volume_format(path):
         case "NIfTI":
             return nifti.files(path)
