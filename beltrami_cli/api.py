@@ -13,7 +13,7 @@ from beltrami_cli.config import Settings, parse_spacing
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.grid import Grid
-from beltrami_cli.inputs import Warnings, grid_around
+from beltrami_cli.inputs import Warnings, grid_around, require_sense_on_mesh
 from beltrami_cli.progress import Phases
 from beltrami_cli.solver import Result, Solver
 from beltrami_cli.surface import Mesh
@@ -53,13 +53,17 @@ def denoise(
     for name in options.keys() - {field.name for field in fields(Settings)}:
         raise RefusedError(f"unknown option {name!r}; the options are the fields of config.Settings")
     settings = Settings(**options)
-    if settings.flat != (levelset is None):
-        raise RefusedError("levelset: expected an array or a Mesh, or None together with flat=True")
-    values, psi = _filled_with_nan(data), None
-    if isinstance(levelset, np.ndarray | list | tuple):
-        psi = _filled_with_nan(np.asanyarray(levelset))
-    mesh = levelset if isinstance(levelset, Mesh) else None
+    if settings.flat != (levelset is None) or not isinstance(levelset, np.ndarray | Mesh | None):
+        raise RefusedError(
+            f"levelset: found {type(levelset).__name__}; expected an array or a Mesh, or None together with flat=True"
+        )
+    if isinstance(on, Mesh) or not all(isinstance(mesh, Mesh) for mesh in on) or (on and settings.flat):
+        raise RefusedError("on: expected a list of Mesh, and a surface, which flat has not")
+    values, mesh = _filled_with_nan(data), levelset if isinstance(levelset, Mesh) else None
+    psi = _filled_with_nan(levelset) if isinstance(levelset, np.ndarray) else None
     at_vertices = mesh is not None and values.ndim < 3
+    if mesh is not None:
+        require_sense_on_mesh(settings, at_vertices)
     shape = _shape(values, len(mesh.vertices_ras_mm) if mesh else None, psi, settings)
     if affine is not None and spacing is not None:
         raise RefusedError("affine and spacing both place the voxels; give one of them")
@@ -125,8 +129,8 @@ def _shape(values: np.ndarray, vertices: int | None, psi: np.ndarray | None, set
     shape = values.shape
     if vertices is not None and values.ndim < 3:
         if shape[:1] != (vertices,) or (values.ndim == 2) != vector:
-            more = ", or (V, K) with kind='vector'" if values.ndim == 2 else ""
-            raise RefusedError(f"data: found the shape {shape}; expected ({vertices},), as the mesh has vertices{more}")
+            wanted = f"({vertices}, K) with kind='vector'" if vector else f"({vertices},), or (V, K) with kind='vector'"
+            raise RefusedError(f"data: found the shape {shape}; expected {wanted}: the mesh has {vertices} vertices")
         shape = shape[:1]
     elif psi is not None:
         shape = psi.shape
@@ -138,8 +142,10 @@ def _shape(values: np.ndarray, vertices: int | None, psi: np.ndarray | None, set
             )
     elif vector and values.ndim > 2:
         shape = values.shape[:-1]
-    if len(shape) not in (2, 3) and vertices is None:
-        raise RefusedError(f"data: found an array of shape {values.shape}; expected 2 or 3 axes")
+    axes = (2, 3) if vertices is None else (1,) if values.ndim < 3 else (3,)
+    if len(shape) not in axes:
+        more = " (several channels need kind='vector')" if values.ndim == 4 else ""
+        raise RefusedError(f"data: found an array of shape {values.shape}; expected {max(axes)} axes{more}")
     if settings.independent and values.shape == shape:
         raise RefusedError(f"independent: found data of shape {values.shape}; expected several frames, (..., K)")
     return shape

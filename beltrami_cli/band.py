@@ -134,7 +134,7 @@ def _around(surface: ZeroSurface, grid: Grid, box: tuple[slice, ...], half_width
     shape = tuple(part.stop - part.start for part in box)
     # Single precision tells near from far as well, and half the bytes come through the cache.
     points, normals = s.points.astype(np.float32), s.normals.astype(np.float32)
-    grown = sheets.grow(shape, spacing, points, normals, s.start, s.ring, half_width)
+    grown = sheets.grow(shape, spacing, points, normals, s.start, s.ring, s.piece, half_width)
     voxel, vertex, first = sheets.arrange(*grown)
     normal, distance = sheets.closest_points(
         voxel, vertex, shape, spacing, s.points, s.normals, s.curvature, s.direction
@@ -143,7 +143,8 @@ def _around(surface: ZeroSurface, grid: Grid, box: tuple[slice, ...], half_width
     forward, backward = np.empty((3, len(voxel)), np.int32), np.empty((3, len(voxel)), np.int32)
     for axis in range(3):
         up, down = (
-            sheets.best_matches(voxel, vertex, first, normal, shape, spacing, s.points, axis, move) for move in (1, -1)
+            sheets.best_matches(voxel, vertex, first, normal, shape, spacing, s.points, s.piece, axis, move)
+            for move in (1, -1)
         )
         forward[axis], backward[axis] = sheets.mutual_links(up, down)
     links = forward.view(np.uint32), backward.view(np.uint32)

@@ -40,14 +40,17 @@ def _in_space(band: Band, known: np.ndarray) -> np.ndarray:
 
 
 def _over_mesh(band: Band, surface: ZeroSurface, known: np.ndarray, limit: float) -> np.ndarray:
+    return distance_over(surface, np.unique(band.vertex[known]), limit)[band.vertex]
+
+
+def distance_over(surface: ZeroSurface, sources: np.ndarray, limit: float) -> np.ndarray:
+    """(V,) mm over the surface from each vertex to the nearest of `sources` (N,), sorted; inf beyond `limit` mm."""
     from scipy.sparse.csgraph import dijkstra
 
-    sources = np.unique(band.vertex[known])
     # Nearest ways leave the sources at once: vertices that no entry owns may lie on them, other sources do not.
     between = np.setdiff1d(np.arange(len(surface.points)), sources)
     graph = paths(surface, between)
-    from_known = dijkstra(graph, directed=False, indices=sources, min_only=True, limit=limit)
-    return np.asarray(from_known[band.vertex])
+    return np.asarray(dijkstra(graph, directed=False, indices=sources, min_only=True, limit=limit))
 
 
 def paths(surface: ZeroSurface, vertices: np.ndarray) -> csr_array:

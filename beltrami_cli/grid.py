@@ -60,7 +60,7 @@ class Grid:
         if counts.prod() > MOST_VOXELS:
             size = " x ".join(f"{x:.4g}" for x in np.ptp(ras_mm, axis=0))
             raise RefusedError(
-                f"spacing: found voxels of {spacing:.4g} mm around a surface of {size} mm, {counts.prod():.3g} of them; "
+                f"spacing: found voxels of {spacing:.4g} mm around a surface of {size} mm: {counts.prod():.3g}; "
                 f"expected at most {MOST_VOXELS:.3g}: give a larger --spacing (is the surface in mm?)"
             )
         a, b, c = map(int, counts)

@@ -30,6 +30,22 @@ def require_usable(grid: Grid, name: str) -> None:
         )
 
 
+def require_sense_on_mesh(settings: Settings, at_vertices: bool) -> None:
+    """Raise RefusedError for settings that a mesh as level set, or data at its vertices, leave no room for."""
+    if settings.inside == "positive":
+        raise RefusedError("inside: is for a level set; the triangles of a surface say where outside is; drop it")
+    if not at_vertices:
+        return
+    if settings.depth is not None:
+        raise RefusedError("depth: averages a volume along the normal; found data at vertices; drop it")
+    if settings.extension != "closest-point":
+        raise RefusedError(
+            f"extension: found {settings.extension}, which is for volumes; data at vertices need closest-point; drop it"
+        )
+    if settings.outside != "nan":
+        raise RefusedError("outside: is for volumes; found data at the vertices of a surface; drop it")
+
+
 def time_step(grid: Grid, settings: Settings) -> float:
     """dt in mm^2 for this grid; raises RefusedError where the one asked for is over the bound."""
     bound = stability_bound(grid.spacing, grid.shape)
@@ -47,6 +63,7 @@ def grid_around(mesh: Mesh, settings: Settings, spacing: float | None = None) ->
     spacing: mm; by default the mesh's median edge: as many voxels as vertices, which hold all that values there say.
     Raises RefusedError as `Grid.around`, DataError where the mesh has no edge.
     """
+    mesh.require_triangles()
     ras_mm, ends = mesh.vertices_ras_mm[np.unique(mesh.cells)], mesh.cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     lengths = np.linalg.norm(np.subtract(*np.moveaxis(mesh.vertices_ras_mm[ends], 1, 0)), axis=1)
     lengths = lengths[lengths > 0]

@@ -42,6 +42,7 @@ class ZeroSurface:
     direction: np.ndarray
     start: np.ndarray
     ring: np.ndarray
+    piece: np.ndarray
 
 
 def crossing_box(psi: np.ndarray, margin: tuple[int, ...]) -> tuple[slice, ...]:
@@ -124,9 +125,10 @@ class Refined:
 def refined(mesh: Mesh, grid: Grid) -> Refined:
     """The mesh for a band on this grid: points in mm along the voxel axes from the grid's first voxel.
 
-    Raises DataError where the mesh has no triangle of any area, or edges so long for the voxels that it cannot be
-    refined.
+    Raises DataError where the mesh has no triangle of any area, vertices that are not finite, triangles that share no
+    vertices, or edges so long for the voxels that it cannot be refined.
     """
+    mesh.require_triangles()
     spacing = grid.spacing
     points = grid.to_index(mesh.vertices_ras_mm) * spacing
     cells = np.ascontiguousarray(facing(mesh.cells, grid), np.int32)
@@ -148,7 +150,13 @@ def refined(mesh: Mesh, grid: Grid) -> Refined:
         splits.append(edges)
     start, ring = kernels.half_edges(cells, len(points))
     normals = kernels.ring_mean(kernels.face_normals(points, cells), start, ring)
-    return Refined(_curved(points, cells, normals, start, ring, spacing.min()), tuple(splits))
+    surface = _curved(points, cells, normals, start, ring, spacing.min())
+    if len(mesh.cells) > 1 and len(np.unique(surface.piece[cells[:, 0]])) > len(mesh.cells) / 2:
+        raise DataError(
+            f"the surface's {len(mesh.cells)} triangles share no vertices; expected neighbours that do: merge vertices "
+            "at one place first"
+        )
+    return Refined(surface, tuple(splits))
 
 
 def _split(points: np.ndarray, cells: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -174,7 +182,7 @@ def _curved(
     curvature, direction = kernels.principal_curvatures(
         points, normals, start, ring, 1 / voxel, (RING_VOXELS * voxel) ** 2
     )
-    return ZeroSurface(points, cells, normals, curvature, direction, start, ring)
+    return ZeroSurface(points, cells, normals, curvature, direction, start, ring, kernels.pieces(start, ring))
 
 
 def thin_first(psi: np.ndarray) -> np.ndarray:

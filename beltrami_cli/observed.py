@@ -14,6 +14,7 @@ import numpy as np
 
 from beltrami_cli.band import Band, band_around
 from beltrami_cli.extension import Extended, extend, from_vertices
+from beltrami_cli.geodesic import distance_along, distance_over
 from beltrami_cli.grid import Grid
 from beltrami_cli.kernels import mesh as kernels
 from beltrami_cli.kinds import Kind
@@ -62,6 +63,9 @@ class Observed(Protocol):
     def seen(self, which: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """What gives the values (K, n) of a band's (K, E) at the places `which` (n,)."""
 
+    def beyond(self, start: Extended, limit: float) -> np.ndarray:
+        """(E,) bool: entries farther than `limit` mm along the surface from valid data."""
+
     def near(self) -> np.ndarray:
         """Valid places (n,) on the surface, where input and output show the same."""
 
@@ -104,6 +108,9 @@ class AtVoxels:
 
     def seen(self, which: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         return lambda u: u[:, which]
+
+    def beyond(self, start: Extended, limit: float) -> np.ndarray:
+        return (distance_along(self.band, start.known, limit) > limit) & ~start.known
 
     def near(self) -> np.ndarray:
         """Those within half a voxel of the surface."""
@@ -194,6 +201,13 @@ class AtVertices:
     def seen(self, which: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         points, turns = self.on.vertices.some(which), self.kind.turns
         return lambda u: points(u, turns=turns)
+
+    def beyond(self, start: Extended, limit: float) -> np.ndarray:
+        # Start values reach over a triangle to its far corner: distance counts from the vertices that hold data.
+        valid = self.trust > 0
+        for ends in self.on.refined.edges:
+            valid = np.concatenate([valid, valid[ends].all(1)])
+        return distance_over(self.on.refined.surface, np.flatnonzero(valid), limit)[self.on.band.vertex] > limit
 
     def near(self) -> np.ndarray:
         return np.flatnonzero(self.trust > 0)

@@ -16,7 +16,15 @@ from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import own_samples
 from beltrami_cli.grid import Canonical, Grid, Volume, require_same_grid, with_channels
-from beltrami_cli.inputs import Warnings, band_of, grid_around, require_usable, time_step, without
+from beltrami_cli.inputs import (
+    Warnings,
+    band_of,
+    grid_around,
+    require_sense_on_mesh,
+    require_usable,
+    time_step,
+    without,
+)
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import sha256, sidecar, sidecar_of, write_record
@@ -310,30 +318,14 @@ def _survey(job: Job) -> _Scene:
 
 def _require_sense(job: Job, at_vertices: bool) -> None:
     """Raise RefusedError for what a surface as LEVELSET, or data at its vertices, leave no room for."""
-    settings = job.settings
+    require_sense_on_mesh(job.settings, at_vertices)
     if job.labels or job.between:
-        raise RefusedError(
-            f"labels, between: are for a segmentation; found LEVELSET {job.levelset}, a surface; drop them"
-        )
-    if settings.inside == "positive":
-        raise RefusedError("inside: is for a level set; a surface's triangles say where outside is; drop it")
-    if not at_vertices:
-        if job.map is not None:
-            raise RefusedError(f"map: is for values at vertices; found DATA {job.data}, a volume; drop --map")
-        return
-    if settings.depth is not None:
-        raise RefusedError(
-            "depth: averages a volume along the normal; found DATA at the vertices of a surface; drop it"
-        )
-    if settings.extension != "closest-point":
-        raise RefusedError(
-            f"extension: found {settings.extension}, which is for volumes; DATA at vertices need closest-point; drop it"
-        )
-    if settings.outside != "nan":
-        raise RefusedError("outside: is for volumes; found DATA at the vertices of a surface; drop it")
-    if job.resample:
-        raise RefusedError("resample: is for volumes; found DATA at the vertices of a surface; drop it")
-    if job.spacing is not None and len(job.spacing) > 1:
+        raise RefusedError(f"labels, between: are for a segmentation; found {job.levelset}, a surface; drop them")
+    if not at_vertices and job.map is not None:
+        raise RefusedError(f"map: is for values at vertices; found DATA {job.data}, a volume; drop --map")
+    if at_vertices and job.resample:
+        raise RefusedError("resample: is for volumes; found data at the vertices of a surface; drop it")
+    if at_vertices and job.spacing is not None and len(job.spacing) > 1:
         raise RefusedError(f"spacing: found {job.spacing}; expected one number: the band around a surface has cubes")
 
 
@@ -357,10 +349,6 @@ def _check_grids(job: Job, surface: Mesh | None) -> Grid:
         if not job.resample:
             require_same_grid(grid, f"{first} {where}", other, f"{name} {path}", remedy=REMEDY)
     require_usable(grid, str(where))
-    if not on_its_grid and 1 in grid.shape and job.levelset is not None:
-        raise RefusedError(
-            f"DATA {where}: found a plane; expected a volume around the surface of LEVELSET {job.levelset}"
-        )
     layout = formats.read_layout(job.data, plane=_is_plane(job, grid)) if several else (1, False)
     formats.require_writable(job.volume, grid, channels=layout[0], is_complex=layout[1])
     if job.filled is not None:

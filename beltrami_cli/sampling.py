@@ -8,7 +8,7 @@ from beltrami_cli.band import Band
 from beltrami_cli.kernels import interpolate
 from beltrami_cli.kernels import mesh as meshes
 from beltrami_cli.kernels.sheets import entries_at_points
-from beltrami_cli.levelset import facing
+from beltrami_cli.levelset import ZeroSurface, facing
 from beltrami_cli.surface import Mesh
 
 # Of the surface's vertices nearest to a point, so many are asked whether they face the same way as it does: a bank that
@@ -23,7 +23,17 @@ class SurfacePoints:
         assert band.surface is not None
         self.band = band
         self.start, self.offset = entries_at_points(
-            band.voxel, band.vertex, band.first, band.box_shape, band.grid.spacing, band.surface.points, ijk, own
+            band.voxel,
+            band.vertex,
+            band.first,
+            band.normal,
+            band.box_shape,
+            band.grid.spacing,
+            band.surface.points,
+            band.surface.normals,
+            band.surface.piece,
+            ijk,
+            own,
         )
         self.origin = np.full(len(ijk), -1, np.int32)
         found = self.start >= 0
@@ -52,6 +62,7 @@ class SurfacePoints:
             out = (total / mass).astype(values.dtype)
         size = np.sqrt((values**2).sum(0)) if turns else np.empty(0, values.dtype)
         interpolate.cubic(values, size, self.origin, self.offset, band.forward, band.nodes, out)
+        out[:, there[self.start] == 0] = np.nan
         return out
 
 
@@ -68,24 +79,38 @@ def vertices_of(band: Band, mesh: Mesh) -> SurfacePoints:
     A vertex belongs to the sheet of the surface's nearest vertex whose normal is not opposed to its own, so that one in
     a sulcus does not take the value of the bank across; none where that is farther than the band is wide.
     """
-    from scipy.spatial import cKDTree
-
+    mesh.require_triangles()
     surface = band.surface
     assert surface is not None
     ijk = band.grid.to_index(mesh.vertices_ras_mm) - [part.start for part in band.box]
     points = ijk * band.grid.spacing
-    apart, near = cKDTree(surface.points).query(points, k=min(NEAREST, len(surface.points)))
-    apart, near = apart.reshape(len(points), -1), near.reshape(len(points), -1)
     normals = meshes.face_normals(points, facing(mesh.cells, band.grid))
-    alike = (surface.normals[near] * normals[:, None]).sum(-1) >= 0
-    best = np.where(alike.any(1), alike.argmax(1), 0)  # a lone vertex has no normal: the nearest one
-    row = np.arange(len(points))
-    reach = band.half_width + 0.5 * float(band.grid.spacing.max())
-    own = near[row, best]
+    own, near = _own_vertices(surface, points, normals, band.half_width + 0.5 * float(band.grid.spacing.max()))
     found = SurfacePoints(band, ijk, own)
-    found.start[apart[row, best] > reach] = -1
-    found.origin[found.start < 0] = -1
+    found.start[~near] = found.origin[~near] = -1
     return found
+
+
+def _own_vertices(
+    surface: ZeroSurface, points: np.ndarray, normals: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) the surface's vertex nearest to each point (N, 3) that faces as it does, else the nearest; and (N,) whether
+    the nearest is within `reach` mm.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(surface.points)
+    apart, own = tree.query(points)
+    asked, among = np.flatnonzero((surface.normals[own] * normals).sum(1) < 0), NEAREST
+    while len(asked):
+        gap, near = tree.query(points[asked], k=min(among, len(surface.points)), distance_upper_bound=reach)
+        there = np.isfinite(gap)
+        alike = there & ((surface.normals[np.where(there, near, 0)] * normals[asked, None]).sum(-1) >= 0)
+        found = alike.any(1)
+        own[asked[found]] = near[found, alike[found].argmax(1)]
+        asked = asked[~found & there[:, -1]] if among < len(surface.points) else asked[:0]
+        among *= 4
+    return own, apart <= reach
 
 
 def surface_mesh(

@@ -13,10 +13,9 @@ import numpy as np
 
 from beltrami_cli.config import Settings
 from beltrami_cli.course import Course
-from beltrami_cli.errors import DataError, NumericsError
+from beltrami_cli.errors import DataError, NumericsError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import Extended
-from beltrami_cli.geodesic import distance_along
 from beltrami_cli.grid import Canonical, Grid
 from beltrami_cli.inputs import (
     Warnings,
@@ -115,6 +114,8 @@ class Solver:
         with phases("band"):
             self.shown: list[tuple[Mesh, SurfacePoints]] = []
             if isinstance(surface, Mesh):
+                if 1 in grid.shape:
+                    raise RefusedError("data: found a plane; expected a volume around the surface, which is a mesh")
                 of_mesh = VertexBand(surface, axes.grid, settings.half_width(grid.used_spacing))
                 self.band = of_mesh.band
                 self.shown.append((surface, of_mesh.vertices))
@@ -261,8 +262,7 @@ class Solver:
             evolution, substeps = course.run(start, plan.flow, plan.schedule, observer, stop)
             values, excess = _within_range(evolution.values, start, course.kind)
             if settings.fill is not None and not start.known.all():
-                far = distance_along(band, start.known, settings.fill) > settings.fill
-                values[:, far & ~start.known] = np.nan
+                values[:, sample.observed.beyond(start, settings.fill)] = np.nan
         if stop is not None and not evolution.iterations:
             warnings.add("stop discrepancy: the start values are as far from the data as the noise: nothing to do")
         if stop is not None and evolution.stop_reason != "discrepancy":

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beltrami_cli.errors import DataError, RefusedError
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -21,6 +23,28 @@ class Mesh:
     cells: np.ndarray
     values: np.ndarray | None = None
     structure: str | None = None
+
+    def __post_init__(self) -> None:
+        """Raises RefusedError for arrays of other shapes, and for cells that name vertices which are not there."""
+        vertices, cells = np.asarray(self.vertices_ras_mm, float), np.asarray(self.cells)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or cells.ndim != 2 or cells.shape[1] not in (2, 3):
+            raise RefusedError(
+                f"mesh: found vertices of shape {vertices.shape} and cells of shape {cells.shape}; "
+                "expected (V, 3) and (C, 3), or (C, 2) for a curve"
+            )
+        if cells.dtype.kind not in "iu" or (cells.size and not 0 <= cells.min() <= cells.max() < len(vertices)):
+            raise RefusedError(
+                f"mesh: its cells name vertices that are not there; expected whole numbers below {len(vertices)}"
+            )
+        object.__setattr__(self, "vertices_ras_mm", vertices)
+        object.__setattr__(self, "cells", np.ascontiguousarray(cells, np.int32))
+
+    def require_triangles(self) -> None:
+        """Raise DataError unless the cells are triangles between vertices at finite places."""
+        if self.cells.shape[1] != 3 or not len(self.cells):
+            raise DataError("the surface has no triangles; expected a triangulated surface")
+        if not np.isfinite(self.vertices_ras_mm[self.cells]).all():
+            raise DataError("the surface has triangles whose vertices lie at no finite place; repair or remove them")
 
     def named_values(self) -> dict[str, np.ndarray]:
         """(V,) values by name: `value`, or `value 1`, `value 2` ... of several channels; empty for geometry alone."""

@@ -51,6 +51,26 @@ def half_edges(cells, vertices):
 
 
 @nb.njit(cache=True)
+def pieces(start, ring):
+    """The number (V,) int32 of the connected piece of the mesh that each vertex is of."""
+    piece, waiting = np.full(len(start) - 1, -1, np.int32), np.empty(len(start) - 1, np.int32)
+    count = 0
+    for seed in range(len(piece)):
+        if piece[seed] >= 0:
+            continue
+        piece[seed], waiting[0], left = count, seed, 1
+        while left:
+            left -= 1
+            v = waiting[left]
+            for q in range(start[v], start[v + 1]):
+                if piece[ring[q]] < 0:
+                    piece[ring[q]], waiting[left] = count, ring[q]
+                    left += 1
+        count += 1
+    return piece
+
+
+@nb.njit(cache=True)
 def face_normals(points, triangles):
     """Sum (V, 3) of the normals of the faces around each vertex, as long as twice their areas (mm^2)."""
     faces = np.zeros_like(points)

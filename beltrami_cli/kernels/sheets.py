@@ -66,18 +66,19 @@ def lies_along_normal(points, normals, v, d, x0, x1, x2, half_width, aside):
 
 
 @nb.njit(cache=True)
-def entry_of_sheet(v, e, vertex, after, points, normals, per_voxel):
+def entry_of_sheet(v, e, vertex, after, points, normals, piece, per_voxel):
     """Of a voxel's entries e, after[e], ... the one on the sheet of vertex v; -1 where there is none."""
     while e >= 0:
         w = vertex[e]
-        if w == v or (squared_voxels(points, v, w, per_voxel) < TWIN_VOXELS**2 and cosine(normals, v, w) > TWIN_COSINE):
+        near = piece[v] == piece[w] and squared_voxels(points, v, w, per_voxel) < TWIN_VOXELS**2
+        if w == v or (near and cosine(normals, v, w) > TWIN_COSINE):
             return e
         e = after[e]
     return -1
 
 
 @nb.njit(cache=True)
-def grow(shape, spacing, points, normals, start, ring, half_width):
+def grow(shape, spacing, points, normals, start, ring, piece, half_width):
     """All entries of the band, in order of growth: a voxel's entries are head[x], after[head[x]], ... to -1.
 
     A voxel has an entry for every sheet of the surface that it lies along the normal of, within `half_width` (mm): the
@@ -113,13 +114,13 @@ def grow(shape, spacing, points, normals, start, ring, half_width):
                 continue
             x = i * stride[0] + j * stride[1] + k
             x0, x1, x2 = i * spacing[0], j * spacing[1], k * spacing[2]
-            e = entry_of_sheet(v, head[x], vertex, after, points, normals, per_voxel)
+            e = entry_of_sheet(v, head[x], vertex, after, points, normals, piece, per_voxel)
             if e >= 0 and squared_distance(points, v, x0, x1, x2) >= distance[e]:
                 continue  # the sheet is there already, by a vertex that v does not better
             w, d = descend(points, start, ring, v, x0, x1, x2)
             if d > reach or not lies_along_normal(points, normals, w, d, x0, x1, x2, half_width, aside):
                 continue
-            e = entry_of_sheet(w, head[x], vertex, after, points, normals, per_voxel)
+            e = entry_of_sheet(w, head[x], vertex, after, points, normals, piece, per_voxel)
             if e >= 0:
                 if d < distance[e]:
                     vertex[e], distance[e] = w, d
@@ -204,7 +205,7 @@ def closest_points(voxel, vertex, shape, spacing, points, normals, curvature, di
 
 
 @nb.njit(cache=True, parallel=True)
-def best_matches(voxel, vertex, first, normal, shape, spacing, points, axis, move):
+def best_matches(voxel, vertex, first, normal, shape, spacing, points, piece, axis, move):
     """For each entry the entry of its neighbour along the axis that has the nearest vertex; itself where none has."""
     stride = (shape[1] * shape[2], shape[2], 1)
     out = np.empty(len(voxel), np.int32)
@@ -219,7 +220,7 @@ def best_matches(voxel, vertex, first, normal, shape, spacing, points, axis, mov
         for o in range(first[y], first[y + 1]):
             facing = normal[0, e] * normal[0, o] + normal[1, e] * normal[1, o] + normal[2, e] * normal[2, o]
             apart = squared_voxels(points, vertex[e], vertex[o], per_voxel)
-            if facing > LINK_COSINE and apart < best:
+            if piece[vertex[e]] == piece[vertex[o]] and facing > LINK_COSINE and apart < best:
                 best = apart
                 out[e] = o
     return out
@@ -236,7 +237,7 @@ def mutual_links(forward, backward):
 
 
 @nb.njit(cache=True, parallel=True)
-def entries_at_points(voxel, vertex, first, shape, spacing, points, ijk, own):
+def entries_at_points(voxel, vertex, first, normal, shape, spacing, points, normals, piece, ijk, own):
     """For points (N, 3) in voxels the entry of their own sheet beside them (N,), -1 where none, and the offset (3, N).
 
     own: (N,) the mesh vertex of each point's sheet. Of the entries in the eight voxels around, the one whose vertex is
@@ -254,8 +255,10 @@ def entries_at_points(voxel, vertex, first, shape, spacing, points, ijk, own):
                 continue
             x = (i * shape[1] + j) * shape[2] + k
             for e in range(first[x], first[x + 1]):
-                apart = squared_voxels(points, vertex[e], own[n], per_voxel)
-                if apart < best:
+                v = own[n]
+                facing = normal[0, e] * normals[v, 0] + normal[1, e] * normals[v, 1] + normal[2, e] * normals[v, 2]
+                apart = squared_voxels(points, vertex[e], v, per_voxel)
+                if piece[v] == piece[vertex[e]] and facing > LINK_COSINE and apart < best:
                     best = apart
                     start[n] = e
                     offset[0, n], offset[1, n], offset[2, n] = ijk[n, 0] - i, ijk[n, 1] - j, ijk[n, 2] - k
