@@ -40,7 +40,7 @@ def denoise(
     weights: confidence of the data, of the shape of one channel, 0 or more (R^2, coherence). mask: alike, which data
         count (not 0).
     affine: (4, 4), voxel indices to RAS mm; or spacing: mm, one number or one per axis (default 1); for values at
-        vertices, spacing alone: that of the band's voxels (default: the mesh's median edge).
+        vertices, spacing alone: that of the band's voxels (default: 2/3 of the mesh's median edge).
     on: other meshes of the surface, in RAS mm, whose vertices get values too, `Result.on`.
     observer: called after every iteration with (iteration, iterations, root mean square change).
     options: the fields of `config.Settings`, such as flow="beltrami", beta=0.05, iterations=20.

@@ -17,6 +17,9 @@ from beltrami_cli.surface import Mesh
 
 # Weights below 0 by no more than this share of the largest are rounding and interpolation.
 NEGATIVE_SHARE = 1e-3
+# Of a band around a mesh. It keeps a map with borders to 25 to 28 dB with 1 voxel per edge, to 30 to 33 dB with 1.5; the
+# time grows with the square.
+VOXELS_PER_EDGE = 1.5
 
 
 def require_usable(grid: Grid, name: str) -> None:
@@ -60,7 +63,7 @@ def time_step(grid: Grid, settings: Settings) -> float:
 def grid_around(mesh: Mesh, settings: Settings, spacing: float | None = None) -> Grid:
     """A grid of cubes that holds the band around a mesh, axes as those of RAS.
 
-    spacing: mm; by default the mesh's median edge: as many voxels as vertices, which hold all that values there say.
+    spacing: mm; by default the mesh's median edge over VOXELS_PER_EDGE.
     Raises RefusedError as `Grid.around`, DataError where the mesh has no edge.
     """
     mesh.require_triangles()
@@ -69,7 +72,7 @@ def grid_around(mesh: Mesh, settings: Settings, spacing: float | None = None) ->
     lengths = lengths[lengths > 0]
     if not len(lengths):
         raise DataError("the surface has no triangle of any area: is it a mesh at all?")
-    h = float(np.median(lengths)) if spacing is None else spacing
+    h = float(np.median(lengths)) / VOXELS_PER_EDGE if spacing is None else spacing
     return Grid.around(ras_mm, h, settings.half_width(np.full(3, h)) + h)
 
 

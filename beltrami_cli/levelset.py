@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,8 +17,8 @@ FLOOR = np.float32(0.1)
 THIN_WEIGHT = np.float32(12)
 # Least squares for curvature: rings smaller than this, in voxels, say little about it.
 RING_VOXELS = 0.1
-# A mesh whose edges (the 95th percentile) are longer than this, in voxels of the smallest spacing, is refined: a band
-# has its entries from the vertices that a voxel lies along the normal of, aside by no more than 1 voxel.
+# Edges of a mesh that are longer than this, in voxels of the smallest spacing, are split: a band has its entries from
+# the vertices that a voxel lies along the normal of, aside by no more than 1 voxel.
 LONGEST_EDGE = 1.5
 MOST_TRIANGLES = 20_000_000  # of a refined mesh: gigabytes of band, and no data that would need them
 
@@ -101,7 +101,7 @@ def zero_surface(psi: np.ndarray, spacing: np.ndarray) -> ZeroSurface:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """A mesh made fine enough for a grid, every triangle split in four at the middle of its edges, some times over.
+    """A mesh made fine enough for a grid: edges that are too long are split in the middle, some times over.
 
     surface: its first vertices are those of the mesh it was made from. edges: for every time, the (M, 2) vertices
     between which the new ones lie.
@@ -136,17 +136,18 @@ def refined(mesh: Mesh, grid: Grid) -> Refined:
     while True:
         ends = np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
         length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
-        if not len(cells) or not length.max() > 0:
+        if not length.max() > 0:
             raise DataError("the surface has no triangle of any area: is it a mesh at all?")
-        if np.percentile(length, 95) <= LONGEST_EDGE * spacing.min():
+        longer = length > LONGEST_EDGE * spacing.min()
+        if not longer.any():
             break
-        if 4 * len(cells) > MOST_TRIANGLES:
+        if len(cells) + longer.sum() > MOST_TRIANGLES:
             raise DataError(
-                f"the surface's edges are {np.percentile(length, 95):.4g} mm long on voxels of {spacing.min():.4g} mm, "
-                f"after {len(splits)} refinements to {len(cells)} triangles; expected a finer mesh or coarser voxels "
-                "(are both in mm?)"
+                f"the surface's edges are up to {length.max():.4g} mm long on voxels of {spacing.min():.4g} mm, after "
+                f"{len(splits)} refinements to {len(cells)} triangles; expected a finer mesh or coarser voxels (are "
+                "both in mm?)"
             )
-        points, cells, edges = _split(points, cells, ends)
+        points, cells, edges = _split(points, cells, ends, longer)
         splits.append(edges)
     start, ring = kernels.half_edges(cells, len(points))
     normals = kernels.ring_mean(kernels.face_normals(points, cells), start, ring)
@@ -156,16 +157,56 @@ def refined(mesh: Mesh, grid: Grid) -> Refined:
             f"the surface's {len(mesh.cells)} triangles share no vertices; expected neighbours that do: merge vertices "
             "at one place first"
         )
-    return Refined(surface, tuple(splits))
+    return Refined(replace(surface, piece=_sewn(surface.points, surface.piece)), tuple(splits))
 
 
-def _split(points: np.ndarray, cells: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, cells and the edges split; ends: (3 C, 2) of the edges 01, 12, 20 of every triangle, sorted."""
-    edges, number = np.unique(ends, axis=0, return_inverse=True)
-    ab, bc, ca = (len(points) + number.reshape(-1, 3)).T
-    a, b, c = cells.T
-    finer = np.concatenate([np.stack(corners, 1) for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
-    return np.concatenate([points, points[edges].mean(1)]), np.ascontiguousarray(finer, np.int32), edges
+def _sewn(points: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """The pieces' numbers (V,), one for all that have a vertex at one place: along a seam vertices stand twice."""
+    if not piece.any():
+        return piece
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    place = np.unique(points, axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.argsort(place, kind="stable")
+    same = place[order][1:] == place[order][:-1]
+    one, other = piece[order[1:][same]], piece[order[:-1][same]]
+    count = int(piece.max()) + 1
+    graph = coo_array((np.ones(len(one), bool), (one, other)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1][piece], np.int32)
+
+
+def _split(
+    points: np.ndarray, cells: np.ndarray, ends: np.ndarray, longer: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, cells and the edges that were split; ends: (3 C, 2) of the edges 01, 12, 20 of every triangle, sorted.
+
+    longer: (3 C,) which of them to split. Both triangles at an edge agree on it, so that the mesh stays closed.
+    """
+    code = ends[:, 0].astype(np.int64) * len(points) + ends[:, 1]
+    new, number = np.unique(code[longer], return_inverse=True)
+    edges = np.stack(np.divmod(new, len(points)), 1)
+    numbers = np.full(len(ends), -1)
+    numbers[longer] = len(points) + number
+    middle = numbers.reshape(-1, 3)
+    count = (middle >= 0).sum(1)
+    # Turned so that of one split edge it comes first, and of two the whole edge last.
+    only, whole = (middle >= 0).argmax(1), (middle < 0).argmax(1)
+    first = np.where(count == 1, only, np.where(count == 2, (whole + 1) % 3, 0))
+    turn = (first[:, None] + np.arange(3)) % 3
+    (a, b, c), (ab, bc, ca) = (np.take_along_axis(x, turn, 1).T for x in (cells, middle))
+    parts = {
+        0: [(a, b, c)],
+        1: [(a, ab, c), (ab, b, c)],
+        2: [(ab, b, bc), (a, ab, bc), (a, bc, c)],
+        3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
+    }
+    finer = [np.stack(corners, 1)[count == n] for n, triangles in parts.items() for corners in triangles]
+    return (
+        np.concatenate([points, points[edges].mean(1)]),
+        np.ascontiguousarray(np.concatenate(finer), np.int32),
+        edges,
+    )
 
 
 def facing(cells: np.ndarray, grid: Grid) -> np.ndarray:

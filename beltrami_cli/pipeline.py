@@ -26,6 +26,7 @@ from beltrami_cli.inputs import (
     without,
 )
 from beltrami_cli.kinds import kind_of
+from beltrami_cli.levelset import two_values
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import sha256, sidecar, sidecar_of, write_record
 from beltrami_cli.resample import resample
@@ -78,7 +79,8 @@ class _Scene:
     """What a job is about, before any volume is read.
 
     grid: to compute on. surface: LEVELSET, where it is a mesh. at_vertices: DATA are values at its vertices.
-    on: the meshes that values are to be put on. structure: of what is written, where the job says it.
+    on: the meshes that values are to be put on. structure: of what is written, where the job says it. header: of the
+    volume whose grid that is, for OUT.
     """
 
     grid: Grid
@@ -86,11 +88,12 @@ class _Scene:
     at_vertices: bool
     on: tuple[Mesh, ...]
     structure: str | None
+    header: Any = None
 
     @property
     def place(self) -> Volume:
         """A volume without values on the grid."""
-        return Volume(np.broadcast_to(np.False_, self.grid.shape), self.grid)
+        return Volume(np.broadcast_to(np.False_, self.grid.shape), self.grid, (), self.header)
 
     def structure_of(self, mesh: Mesh) -> str | None:
         return self.structure or mesh.structure
@@ -166,6 +169,8 @@ def _denoise_vertices(
     count, dtype, several = len(scene.surface.vertices_ras_mm), job.settings.precision, job.settings.kind == "vector"
     with phases("read"):
         data = formats.read_overlay(job.data, count, dtype=dtype, channels=several, map=_map(job.map))
+        if several and data.ndim == 1:
+            data = data[:, None]
         weights, mask = (
             None if path is None else formats.read_overlay(path, count, dtype=dtype) for path in (job.weights, job.mask)
         )
@@ -280,6 +285,8 @@ def _values_are(out: Path, mesh: Path) -> bool:
 
 def _survey(job: Job) -> _Scene:
     """What the job is about, from headers and surfaces; raises RefusedError where files will not do."""
+    for path in job.all_inputs:
+        formats.require_file(path)
     structure = None if job.structure is None else formats.parse_structure(job.structure)
     surface, at_vertices = None, False
     if formats.is_surface(job.data):
@@ -295,6 +302,10 @@ def _survey(job: Job) -> _Scene:
             f"DATA {job.data}: values at the vertices of a surface; found {found}: give the surface as LEVELSET, or "
             "DATA as a volume"
         )
+    if job.map is not None and not at_vertices:
+        raise RefusedError(f"map: is for values at vertices; found DATA {job.data}, a volume; drop --map")
+    if job.frame is not None and surface is None and not job.on:
+        raise RefusedError("frame: is for surfaces; found none among LEVELSET and --on; drop --frame")
     if at_vertices:
         assert surface is not None
         spacing = None if job.spacing is None else job.spacing[0]
@@ -313,7 +324,10 @@ def _survey(job: Job) -> _Scene:
         job.settings.half_width(grid.used_spacing)
     like = None if at_vertices else grid
     on = tuple(formats.read_surface(path, frame=job.frame, like=like) for path, _ in job.on)
-    return _Scene(grid, surface, at_vertices, on, structure)
+    header = None
+    if job.resample and surface is None and job.levelset is not None:
+        header = formats.open_series(job.levelset, spacing=_spacing_for(job.levelset, job.spacing)).header
+    return _Scene(grid, surface, at_vertices, on, structure, header)
 
 
 def _require_sense(job: Job, at_vertices: bool) -> None:
@@ -321,8 +335,6 @@ def _require_sense(job: Job, at_vertices: bool) -> None:
     require_sense_on_mesh(job.settings, at_vertices)
     if job.labels or job.between:
         raise RefusedError(f"labels, between: are for a segmentation; found {job.levelset}, a surface; drop them")
-    if not at_vertices and job.map is not None:
-        raise RefusedError(f"map: is for values at vertices; found DATA {job.data}, a volume; drop --map")
     if at_vertices and job.resample:
         raise RefusedError("resample: is for volumes; found data at the vertices of a surface; drop it")
     if at_vertices and job.spacing is not None and len(job.spacing) > 1:
@@ -358,12 +370,18 @@ def _check_grids(job: Job, surface: Mesh | None) -> Grid:
 
 def _has_a_grid_of_its_own(job: Job, several: bool) -> bool:
     """True for a segmentation on another grid than DATA, where neither is to be brought onto the other's."""
-    if job.levelset is None or job.resample:
+    if job.levelset is None:
         return False
-    if job.labels or job.between:
-        return True
-    grids = _grid_of(job, job.levelset), _grid_of(job, job.data, channels=several)
-    return not grids[0].matches(grids[1]) and is_segmentation(_read(job, job.levelset, Warnings(None)).data)
+    own = _grid_of(job, job.levelset)
+    labelled = bool(job.labels or job.between)
+    if 1 in own.shape:
+        if labelled:
+            raise RefusedError(f"labels, between: are for volumes; found LEVELSET {job.levelset}, a plane; give a mask")
+        return False
+    if labelled or job.resample:
+        return not job.resample
+    data = _grid_of(job, job.data, channels=several)
+    return not own.matches(data) and is_segmentation(_read(job, job.levelset, Warnings(None)).data)
 
 
 def _grid_of(job: Job, path: Path, *, channels: bool = False, plane: bool = False) -> Grid:
@@ -413,7 +431,11 @@ def _read_levelset(job: Job, scene: _Scene, warnings: Warnings) -> Volume | Mesh
     if isinstance(source, Volume):
         _pass_on(source, warnings)
     elif job.settings.inside == "positive":
-        raise RefusedError(f"inside: is for a level set; found LEVELSET {job.levelset}, a segmentation; drop it")
+        volume = _read(job, job.levelset, warnings)
+        mask = two_values(volume.data)
+        if mask is None or mask[0] >= 0 or not volume.grid.matches(scene.grid):
+            raise RefusedError(f"inside: is for a level set; found LEVELSET {job.levelset}, a segmentation; drop it")
+        return volume
     return source
 
 

@@ -85,32 +85,43 @@ def vertices_of(band: Band, mesh: Mesh) -> SurfacePoints:
     ijk = band.grid.to_index(mesh.vertices_ras_mm) - [part.start for part in band.box]
     points = ijk * band.grid.spacing
     normals = meshes.face_normals(points, facing(mesh.cells, band.grid))
-    own, near = _own_vertices(surface, points, normals, band.half_width + 0.5 * float(band.grid.spacing.max()))
+    own = _own_vertices(surface, points, normals, band.half_width + 0.5 * float(band.grid.spacing.max()))
     found = SurfacePoints(band, ijk, own)
-    found.start[~near] = found.origin[~near] = -1
+    found.start[own < 0] = found.origin[own < 0] = -1
     return found
 
 
-def _own_vertices(
-    surface: ZeroSurface, points: np.ndarray, normals: np.ndarray, reach: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) the surface's vertex nearest to each point (N, 3) that faces as it does, else the nearest; and (N,) whether
-    the nearest is within `reach` mm.
+def _own_vertices(surface: ZeroSurface, points: np.ndarray, normals: np.ndarray, reach: float) -> np.ndarray:
+    """(N,) the surface's vertex nearest to each point (N, 3) within `reach` mm that faces as it does; -1 for none.
+
+    Where the mesh faces the other way as a whole its normals are turned: those of its vertices that see one bank only
+    say so. A lone vertex (a normal of 0) has the nearest.
     """
     from scipy.spatial import cKDTree
 
     tree = cKDTree(surface.points)
-    apart, own = tree.query(points)
-    asked, among = np.flatnonzero((surface.normals[own] * normals).sum(1) < 0), NEAREST
+    gap, near = tree.query(points, k=min(NEAREST, len(surface.points)), distance_upper_bound=reach)
+    gap, near = gap.reshape(len(points), -1), near.reshape(len(points), -1)
+    there = np.isfinite(gap)
+    facing_them = (surface.normals[np.where(there, near, 0)] * normals[:, None]).sum(-1)
+    side = np.where(there, np.sign(facing_them), 0).sum(1)
+    alone = there[:, 0] & (np.abs(side) == there.sum(1))
+    if side[alone].sum() < 0:
+        normals = -normals
+    own = np.where(there[:, 0], near[:, 0], -1)
+    opposed = (surface.normals[own] * normals).sum(1) < 0
+    asked, among = np.flatnonzero((own >= 0) & opposed), NEAREST
+    own[asked] = -1
     while len(asked):
         gap, near = tree.query(points[asked], k=min(among, len(surface.points)), distance_upper_bound=reach)
-        there = np.isfinite(gap)
+        there = np.isfinite(gap).reshape(len(asked), -1)
+        near = near.reshape(len(asked), -1)
         alike = there & ((surface.normals[np.where(there, near, 0)] * normals[asked, None]).sum(-1) >= 0)
         found = alike.any(1)
         own[asked[found]] = near[found, alike[found].argmax(1)]
         asked = asked[~found & there[:, -1]] if among < len(surface.points) else asked[:0]
         among *= 4
-    return own, apart <= reach
+    return own
 
 
 def surface_mesh(

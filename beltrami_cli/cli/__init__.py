@@ -41,7 +41,9 @@ for command in (denoise, levelset, mesh, sample, phantom, compare, info, demo):
 
 def main(args: list[str] | None = None) -> int:
     """Run the command line and return its exit code; every failure is one line on stderr."""
-    before = {number: signal.signal(number, _stop) for number in STOPPED}
+    # A shell that starts a command in the background may have told it to ignore Ctrl-C.
+    heeded = [number for number in STOPPED if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, _stop) for number in heeded}
     try:
         return _run(args)
     finally:

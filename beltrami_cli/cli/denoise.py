@@ -74,7 +74,7 @@ class Denoise(Command):
     "--spacing",
     metavar="S|SX,SY,SZ",
     help="Voxel size in mm of .npy inputs (default: 1), or of the band around a surface with DATA at its vertices "
-    "(default: its median edge).",
+    "(default: 2/3 of its median edge).",
 )
 @click.option(
     "--resample", is_flag=True, default=None, help="Bring DATA, weights and mask onto LEVELSET's grid (trilinear)."

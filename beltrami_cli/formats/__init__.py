@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.formats import checks, freesurfer, gifti, metaimage, mgh, nifti, npy, plain_mesh, png
-from beltrami_cli.formats.checks import writing
+from beltrami_cli.formats.checks import require_file, writing
 from beltrami_cli.formats.overlays import (
     is_overlay,
     overlay_files,
@@ -50,6 +50,7 @@ __all__ = [
     "read_overlay",
     "read_surface",
     "read_volume",
+    "require_file",
     "require_writable",
     "stem",
     "structure_of_name",
