@@ -19,6 +19,7 @@ from beltrami_cli.flows import FLOWS, PHI_LAWS, SCHEMES
 from beltrami_cli.kinds import KINDS
 
 LAWS = ("linear", "geometric")
+FRAMES = ("scanner", "tkr")  # of a surface's coordinates
 STOPS = ("auto", "discrepancy", "decorrelation")
 DEFAULT_ITERATIONS = 20  # as in every example of the paper
 MOST_ITERATIONS = 10_000_000  # a typing error: days of work even on the smallest surface
@@ -419,8 +420,8 @@ class Job:
             raise RefusedError("flat: there is no surface; drop --on, --labels and --between")
         if self.labels and self.between:
             raise RefusedError("labels and between both say where in LEVELSET the surface is; give one of them")
-        if self.frame not in ("scanner", "tkr", None):
-            raise RefusedError(f"frame: found {self.frame!r}; expected scanner or tkr")
+        if self.frame not in (*FRAMES, None):
+            raise RefusedError(f"frame: found {self.frame!r}; expected {' or '.join(FRAMES)}")
 
     @property
     def inputs(self) -> list[Path]:
@@ -531,7 +532,7 @@ def parse_on(given: str, folder: Path = Path()) -> tuple[Path, Path]:
 
     Raises RefusedError for anything else.
     """
-    surface, equals, file = given.partition("=")
+    surface, equals, file = (part.strip() for part in given.partition("="))
     if not (surface and equals and file):
         raise RefusedError(f"on: found {given!r}; expected SURFACE=FILE, as in lh.mid.surf.gii=lh.map.func.gii")
     return folder / surface, folder / file
@@ -564,8 +565,14 @@ def _from_toml(path: Path, section: str, key: str, value: Any) -> Any:
         if not all(isinstance(pair, str) for pair in pairs):
             raise RefusedError(f"{where}: found {value!r}; expected SURFACE=FILE, or a list of them")
         return tuple(parse_on(pair, path.parent) for pair in pairs)
-    if key in ("labels", "between", "map"):
-        return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+    if key in ("labels", "between"):
+        return ",".join(_text(where, part) for part in (value if isinstance(value, list) else [value]))
+    if key == "map":
+        return _text(where, value)
+    if key == "structure" and not isinstance(value, str):
+        raise RefusedError(f"{where}: found {value!r}; expected a name, as CortexLeft")
+    if key == "frame" and value not in FRAMES:
+        raise RefusedError(f"{where}: found {value!r}; expected {' or '.join(FRAMES)}")
     if key == "spacing":
         return parse_spacing(value)
     if key == "beta":
@@ -573,6 +580,13 @@ def _from_toml(path: Path, section: str, key: str, value: Any) -> Any:
     if key == "dt" and value == "auto":
         return None
     return value
+
+
+def _text(where: str, value: Any) -> str:
+    """A text or a whole number as text."""
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise RefusedError(f"{where}: found {value!r}; expected a text or a whole number")
+    return str(value)
 
 
 def _path(config: Path, where: str, value: Any) -> Path:

@@ -11,8 +11,7 @@ import numpy as np
 
 from beltrami_cli.errors import DataError
 from beltrami_cli.grid import Grid
-from beltrami_cli.repair import Repaired, edges, repaired
-from beltrami_cli.surface import Mesh
+from beltrami_cli.repair import Repaired, edges
 
 # Half-width, in voxels of the largest spacing: the band of 4 of a flow, and 2 for the stencils at its edge.
 HALF_WIDTH = 6.0
@@ -26,24 +25,24 @@ BANKS_SAMPLE = 4000  # triangles that are asked how far the bank across is
 AT_ONCE = 2_000_000  # voxels asked in one call: 0.3 GB
 
 
-def signed_distance(mesh: Mesh, grid: Grid, half_width: float | None = None) -> np.ndarray:
+def signed_distance(surface: Repaired, grid: Grid, half_width: float | None = None) -> np.ndarray:
     """Psi, float32 of `grid.shape`, mm in the world: negative inside, exact within `half_width` mm of the triangles.
 
     half_width: default `HALF_WIDTH` voxels of the largest spacing.
 
     A surface is closed where its only borders are those of small holes, see `repair.repaired`. Inside is where its
     winding number is over 1/2 (Jacobson et al. 2013; Barill et al. 2018), so that self-intersections do no harm and of
-    parts that overlap the union counts; one that faces inwards as a whole is turned. Farther away Psi is half_width.
+    parts that overlap the union counts; where the surface is meant inside out, the reverse. Farther away Psi is
+    half_width.
 
     Else it is open. The sign is that of the angle-weighted pseudonormal at the closest point (Baerentzen and Aanaes
     2005), triangles being counter-clockwise seen from outside. Psi is NaN where the closest point lies on the border,
     so that the zero level ends where the surface does; where the two sides meet away from the surface, as they may
     across what was cut off; and farther away, but where everything around is on one side.
 
-    Raises DataError where the mesh has no usable triangle, or where no two voxels have the surface between them.
+    Raises DataError where no two voxels have the surface between them.
     """
     width = HALF_WIDTH * float(grid.used_spacing.max()) if half_width is None else half_width
-    surface = repaired(mesh)
     ask = _Closed(surface) if surface.is_closed else _Open(surface)
     psi = np.full(grid.shape, np.nan, np.float32)
     for box, points in _boxes(grid, surface.vertices, width):
@@ -53,19 +52,18 @@ def signed_distance(mesh: Mesh, grid: Grid, half_width: float | None = None) -> 
     if not (np.any(psi < 0) and np.any(psi >= 0)):
         raise DataError(_no_crossing(surface.vertices, grid))
     _extend_sides(psi, width)
-    return psi
+    return -psi if surface.inside_out else psi
 
 
-def own_grid(mesh: Mesh, spacing: float | None = None, margin: float | None = None) -> Grid:
-    """A grid around the mesh of cubic voxels, its axes along RAS.
+def own_grid(surface: Repaired, spacing: float | None = None, margin: float | None = None) -> Grid:
+    """A grid around the surface of cubic voxels, its axes along RAS.
 
-    spacing: mm; by default the median edge, for finer voxels would say no more than the mesh does, or less where that
+    spacing: mm; by default the median edge, for finer voxels would say no more than a mesh does, or less where that
         takes `VOXELS_BETWEEN_BANKS` voxels between opposite banks.
     margin: mm beyond the vertices on every side; by default the half-width of `signed_distance` and one voxel more.
 
-    Raises RefusedError as `Grid.around`, DataError for a mesh without triangles.
+    Raises RefusedError as `Grid.around`.
     """
-    surface = repaired(mesh)
     step = _resolution(surface) if spacing is None else spacing
     around = (HALF_WIDTH + 1) * step if margin is None else margin
     return Grid.around(surface.vertices[np.unique(surface.cells)], step, around)
@@ -200,6 +198,12 @@ def _links(spacing: np.ndarray) -> Iterator[tuple[tuple[slice, ...], tuple[slice
 
 def _no_crossing(vertices: np.ndarray, grid: Grid) -> str:
     corners = grid.corners()
+    if np.all((vertices >= corners.min(0)) & (vertices <= corners.max(0))):
+        steps, size = (" x ".join(f"{x:.4g}" for x in mm) for mm in (grid.spacing, np.ptp(vertices, axis=0)))
+        return (
+            f"the surface runs between no two voxels: found voxels of {steps} mm around a surface of {size} mm; "
+            "expected smaller ones: give --spacing, or --like with a finer volume"
+        )
     return (
         f"the surface runs between no two voxels of the volume: found it from {_place(vertices.min(0))} to "
         f"{_place(vertices.max(0))}, the voxels from {_place(corners.min(0))} to {_place(corners.max(0))} RAS mm; "

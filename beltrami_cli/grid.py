@@ -147,6 +147,12 @@ class Canonical:
         return np.flip(array, self._flips).transpose(*np.argsort(self._order), *range(3, array.ndim))
 
 
+def extent(ras_mm: np.ndarray) -> str:
+    """The box around points (N, 3) in RAS mm, for messages: `-5.1..11.7 x 0..3.25 x 1..2 mm`."""
+    ends = zip(ras_mm.min(0), ras_mm.max(0), strict=True)
+    return " x ".join(f"{low:.4g}..{high:.4g}" for low, high in ends) + " mm"
+
+
 def require_same_grid(first: Grid, first_name: str, second: Grid, second_name: str, *, remedy: str) -> None:
     """Raise RefusedError, with the remedy and both grids printed below it, unless the two grids match."""
     if not first.matches(second):

@@ -13,12 +13,12 @@ from beltrami_cli.flows import DT_SHARE, stability_bound
 from beltrami_cli.grid import Canonical, Grid
 from beltrami_cli.levelset import refined, two_values
 from beltrami_cli.segmentation import smooth_surface
-from beltrami_cli.surface import Mesh
+from beltrami_cli.surface import Mesh, edges_of
 
 # Weights below 0 by no more than this share of the largest are rounding and interpolation.
 NEGATIVE_SHARE = 1e-3
-# Of a band around a mesh. It keeps a map with borders to 25 to 28 dB with 1 voxel per edge, to 30 to 33 dB with 1.5; the
-# time grows with the square.
+# Of a band around a mesh. It keeps a map with borders to 25 to 28 dB with 1 voxel per edge, to 30 to 33 dB with 1.5;
+# the time grows with the square.
 VOXELS_PER_EDGE = 1.5
 
 
@@ -67,7 +67,7 @@ def grid_around(mesh: Mesh, settings: Settings, spacing: float | None = None) ->
     Raises RefusedError as `Grid.around`, DataError where the mesh has no edge.
     """
     mesh.require_triangles()
-    ras_mm, ends = mesh.vertices_ras_mm[np.unique(mesh.cells)], mesh.cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    ras_mm, ends = mesh.vertices_ras_mm[np.unique(mesh.cells)], edges_of(mesh.cells)
     lengths = np.linalg.norm(np.subtract(*np.moveaxis(mesh.vertices_ras_mm[ends], 1, 0)), axis=1)
     lengths = lengths[lengths > 0]
     if not len(lengths):

@@ -9,7 +9,7 @@ import numpy as np
 from beltrami_cli import formats
 from beltrami_cli.config import Settings
 from beltrami_cli.errors import BeltramiError, RefusedError
-from beltrami_cli.grid import Canonical, Grid, Volume, require_same_grid
+from beltrami_cli.grid import Canonical, Grid, Volume, extent, require_same_grid
 from beltrami_cli.inputs import Warnings, band_of, require_usable
 from beltrami_cli.levelset import crossing_box, two_values
 from beltrami_cli.metrics import Difference, difference
@@ -21,6 +21,9 @@ REMEDY = "bring them onto one grid first, for example with denoise --resample"
 # Of an overlay with many maps, as of a time series, and of many labels only the first are listed.
 MOST_MAPS = 12
 MOST_LABELS = 12
+
+# mm: no brain is as small, but one in metres is.
+SMALLEST_SURFACE = 1.0
 
 
 def compare_volumes(
@@ -87,19 +90,24 @@ def describe_surface(path: Path) -> list[str]:
     edges, triangles = _edges(cells)
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     border, shared = int((triangles == 1).sum()), int((triangles > 2).sum())
-    extent = " x ".join(f"{low:.4g}..{high:.4g}" for low, high in zip(points.min(0), points.max(0), strict=True))
     lines = [
-        f"{formats.surface_format(path)} surface, {len(points)} vertices, {len(cells)} triangles, "
+        f"{formats.surface_format(path)} surface, {len(points)} vertices, {_count(len(cells), 'triangle')}, "
         f"edges of {np.median(length):.3g} mm (median)",
-        f"within {extent} mm (RAS); coordinates: {_frame(path, mesh)}",
-        f"open: {border} border edges" if border else "closed: no border edges",
+        f"within {extent(points)} (RAS); coordinates: {_frame(path, mesh)}",
+        f"open: {_count(border, 'border edge')}" if border else "closed: no border edges",
         f"structure: {mesh.structure or 'not told'}",
     ]
+    if np.ptp(points, axis=0).max() < SMALLEST_SURFACE:
+        lines.append("in doubt: a surface of less than 1 mm; expected coordinates in mm: are they in metres?")
     if shared:
-        lines.append(f"{shared} edges are shared by more than two triangles: expected a surface without branches")
+        lines.append(f"{_count(shared, 'edge')} shared by more than two triangles: expected a surface without branches")
     if lost := len(points) - len(np.unique(cells)):
-        lines.append(f"{lost} vertices belong to no triangle")
+        lines.append(f"{_count(lost, 'vertex', 'vertices')} of no triangle")
     return lines
+
+
+def _count(number: int, one: str, several: str = "") -> str:
+    return f"{number} {one if number == 1 else several or one + 's'}"
 
 
 def _edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -121,11 +129,13 @@ def _frame(path: Path, mesh: Mesh) -> str:
 
 
 def describe_overlay(path: Path) -> list[str]:
-    """Lines on format, vertices and values of vertex data, a line for each map; raises as `formats.read_maps`."""
+    """Lines on format, vertices, structure and values of vertex data, a line for each map; raises as `formats.read_maps`."""
     maps = formats.read_maps(path)
     vertices = len(next(iter(maps.values())))
-    several = f"{len(maps)} maps" if len(maps) > 1 else "1 map"
-    lines = [f"{formats.overlay_format(path)} vertex data, {vertices} vertices, {several}"]
+    lines = [
+        f"{formats.overlay_format(path)} vertex data, {vertices} vertices, {_count(len(maps), 'map')}",
+        f"structure: {formats.overlay_structure(path) or 'not told'}",
+    ]
     lines += [f"{name}: {_spread_of(values)}" for name, values in list(maps.items())[:MOST_MAPS]]
     if len(maps) > MOST_MAPS:
         lines.append(f"... and {len(maps) - MOST_MAPS} more")

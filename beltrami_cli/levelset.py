@@ -19,7 +19,7 @@ THIN_WEIGHT = np.float32(12)
 RING_VOXELS = 0.1
 # Edges of a mesh that are longer than this, in voxels of the smallest spacing, are split: a band has its entries from
 # the vertices that a voxel lies along the normal of, aside by no more than 1 voxel.
-LONGEST_EDGE = 1.5
+LONGEST_EDGE = 1.25
 MOST_TRIANGLES = 20_000_000  # of a refined mesh: gigabytes of band, and no data that would need them
 
 

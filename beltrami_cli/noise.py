@@ -98,9 +98,9 @@ def smoothness_mm(band: Band, values: np.ndarray, kind: Kind) -> float:
     return _fwhm(np.concatenate(near, axis=1), np.concatenate(far, axis=1), np.concatenate(squares), kind)
 
 
-def smoothness_on_mesh(points: np.ndarray, cells: np.ndarray, values: np.ndarray, kind: Kind) -> float:
-    """As `smoothness_mm`, of values (K, V) at vertices (V, 3), mm, of triangles (C, 3): over the edges."""
-    a, b = np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0).T
+def smoothness_on_mesh(points: np.ndarray, edges: np.ndarray, values: np.ndarray, kind: Kind) -> float:
+    """As `smoothness_mm`, of values (K, V) at vertices (V, 3), mm, over the edges (N, 2) of a mesh."""
+    a, b = edges.T
     x = values.astype(float)
     return _fwhm(x[:, a], x[:, b], ((points[a] - points[b]) ** 2).sum(1), kind)
 

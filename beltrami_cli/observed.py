@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -28,7 +29,7 @@ from beltrami_cli.noise import (
     smoothness_on_mesh,
 )
 from beltrami_cli.sampling import SurfacePoints
-from beltrami_cli.surface import Mesh
+from beltrami_cli.surface import Mesh, edges_of
 
 # Half of the valid voxels 1 to 2 voxels from the surface are held out. Nearer ones make the start values, which would
 # miss them: where one is held out the flow has a gap to fill, and longer runs win that are too long for all data. Where
@@ -42,7 +43,7 @@ VERTEX_SHARE = 0.15  # every vertex makes start values too
 class Observed(Protocol):
     """Data (K, N) at N places, as channels; NaN in all of them where there are none.
 
-    trust: (N,) weights in 0..1, 0 where missing. places: what they are, in words.
+    trust: (N,) weights in 0..1, 0 where missing. noun: what the places are.
     """
 
     @property
@@ -52,7 +53,7 @@ class Observed(Protocol):
     @property
     def trust(self) -> np.ndarray: ...
     @property
-    def places(self) -> str: ...
+    def noun(self) -> str: ...
 
     def start(self) -> Extended:
         """The values on the band from which a flow starts; raises DataError where there are none."""
@@ -63,8 +64,8 @@ class Observed(Protocol):
     def seen(self, which: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """What gives the values (K, n) of a band's (K, E) at the places `which` (n,)."""
 
-    def beyond(self, start: Extended, limit: float) -> np.ndarray:
-        """(E,) bool: entries farther than `limit` mm along the surface from valid data."""
+    def beyond(self, start: Extended) -> np.ndarray:
+        """(E,) bool: entries that are to stay missing, farther than `fill` mm along the surface from valid data."""
 
     def near(self) -> np.ndarray:
         """Valid places (n,) on the surface, where input and output show the same."""
@@ -86,7 +87,7 @@ class Observed(Protocol):
 class AtVoxels:
     """Data at the entries that voxels belong to (`extension.own_samples`): values (K, E), trust (E,).
 
-    extension, depth: see `extension.extend`.
+    extension, depth: see `extension.extend`. fill: mm, see `config.Settings`.
     """
 
     band: Band
@@ -95,7 +96,8 @@ class AtVoxels:
     trust: np.ndarray
     extension: str = "closest-point"
     depth: tuple[float, float] | None = None
-    places = "voxels"
+    fill: float | None = None
+    noun = "voxels"
 
     def start(self) -> Extended:
         return extend(
@@ -109,8 +111,10 @@ class AtVoxels:
     def seen(self, which: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         return lambda u: u[:, which]
 
-    def beyond(self, start: Extended, limit: float) -> np.ndarray:
-        return (distance_along(self.band, start.known, limit) > limit) & ~start.known
+    def beyond(self, start: Extended) -> np.ndarray:
+        if self.fill is None or start.known.all():
+            return np.zeros(self.band.entries, bool)
+        return (distance_along(self.band, start.known, self.fill) > self.fill) & ~start.known
 
     def near(self) -> np.ndarray:
         """Those within half a voxel of the surface."""
@@ -164,6 +168,16 @@ class VertexBand:
         """(V,) bool: the vertices that lie in the grid and belong to a triangle."""
         return self.vertices.start >= 0
 
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """(N, 2) of the mesh."""
+        return edges_of(self.mesh.cells)
+
+    @property
+    def edge_lengths(self) -> np.ndarray:
+        """(N,) mm."""
+        return np.linalg.norm(np.subtract(*np.moveaxis(self.points[self.edges], 1, 0)), axis=1)
+
     def on_faces(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (E, 3) of the refined mesh and their weights (E, 3) at every entry's closest point."""
         band, surface = self.band, self.refined.surface
@@ -179,7 +193,7 @@ class VertexBand:
 class AtVertices:
     """Data at the vertices of the mesh that a band is around: values (K, V), trust (V,).
 
-    corners, weights: of `VertexBand.on_faces`.
+    corners, weights: of `VertexBand.on_faces`. fill: mm, see `config.Settings`.
     """
 
     on: VertexBand
@@ -188,7 +202,8 @@ class AtVertices:
     kind: Kind
     values: np.ndarray
     trust: np.ndarray
-    places = "vertices"
+    fill: float | None = None
+    noun = "vertices"
 
     def start(self) -> Extended:
         values, trust = self.on.refined.carry(self.values, self.trust)
@@ -202,12 +217,19 @@ class AtVertices:
         points, turns = self.on.vertices.some(which), self.kind.turns
         return lambda u: points(u, turns=turns)
 
-    def beyond(self, start: Extended, limit: float) -> np.ndarray:
-        # Start values reach over a triangle to its far corner: distance counts from the vertices that hold data.
+    @cached_property
+    def too_far(self) -> np.ndarray:
+        """(V',) bool: vertices of the refined mesh, those of the mesh first, that `fill` leaves without a value."""
         valid = self.trust > 0
         for ends in self.on.refined.edges:
             valid = np.concatenate([valid, valid[ends].all(1)])
-        return distance_over(self.on.refined.surface, np.flatnonzero(valid), limit)[self.on.band.vertex] > limit
+        if self.fill is None:
+            return np.zeros(len(valid), bool)
+        return distance_over(self.on.refined.surface, np.flatnonzero(valid), self.fill) > self.fill
+
+    def beyond(self, start: Extended) -> np.ndarray:
+        # An entry with one corner within reach is part of what that vertex shows.
+        return self.too_far[self.corners].all(1)
 
     def near(self) -> np.ndarray:
         return np.flatnonzero(self.trust > 0)
@@ -221,7 +243,7 @@ class AtVertices:
 
     def smoothness_mm(self, u: np.ndarray | None = None) -> float:
         values = self.values if u is None else self.on.vertices(u, turns=self.kind.turns)
-        return smoothness_on_mesh(self.on.points, self.on.cells, values, self.kind)
+        return smoothness_on_mesh(self.on.points, self.on.edges, values, self.kind)
 
     def looks_correlated(self) -> bool:
         start, ring = kernels.half_edges(self.on.cells, len(self.on.points))

@@ -120,7 +120,7 @@ class Planner:
             return True
         why = None
         if sample.observed.can_hold_out()[1] < LEAST_HELD:
-            why = f"there are too few valid {sample.observed.places} beside the surface to hold some out"
+            why = f"there are too few valid {sample.observed.noun} beside the surface to hold some out"
         elif sample.looks_correlated:
             why = f"{CORRELATED}, so that held-out ones would be predicted from their own copies"
         if why:
@@ -149,7 +149,7 @@ class Planner:
             )
         elif self.settings.stop == "auto" and not choice.is_clear and not self.settings.flat:
             self.warnings.add(
-                f"automatic choice: no run predicts the held-out {sample.observed.places} clearly better than the data "
+                f"automatic choice: no run predicts the held-out {sample.observed.noun} clearly better than the data "
                 f"as they are; {way_out}"
             )
         if choice.at_end:

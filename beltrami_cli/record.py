@@ -77,7 +77,7 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
         "TypicalSlope": plan.slope,
         "Noise": {
             "sd": [_number(sd) for sd in plan.noise],
-            "meaning": f"robust standard deviation over {ran.observed.places} on the surface, data units, per channel",
+            "meaning": f"robust standard deviation over {ran.observed.noun} on the surface, data units, per channel",
         },
         "Smoothness": {
             "before_mm": _number(ran.smoothness[0]),
@@ -86,11 +86,11 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
         },
         "Removed": {
             "rms": _number(ran.kind.spread(given[:, there], left[:, there])),
-            ran.observed.places: int(there.sum()),
-            "meaning": f"input minus output at valid {ran.observed.places} within half a voxel of the surface",
+            ran.observed.noun: int(there.sum()),
+            "meaning": f"input minus output at valid {ran.observed.noun} within half a voxel of the surface",
         },
         "ClippedExcess": ran.excess,
-        "Choice": None if plan.choice is None else _chosen(plan.choice, ran.observed.places),
+        "Choice": None if plan.choice is None else _chosen(plan.choice, ran.observed.noun),
         "PerIteration": {
             "beta": beta.tolist(),
             "dt": [schedule.dt] * len(beta),

@@ -22,37 +22,43 @@ class Repaired:
     """A surface of triangles with an area, all facing one way where that can be.
 
     vertices: (V, 3) float64, mm. cells: (C, 3) int64. border: (B, 2) int64, the directed edges where an open surface
-    ends; none where it is closed, and then it faces outwards.
+    ends; none where it is closed, and then it faces outwards. inside_out: what is meant to be inside is what lies
+    beyond it.
     """
 
     vertices: np.ndarray
     cells: np.ndarray
     border: np.ndarray
+    inside_out: bool = False
 
     @property
     def is_closed(self) -> bool:
         return not len(self.border)
 
 
-def repaired(mesh: Mesh) -> Repaired:
+def repaired(mesh: Mesh, *, as_faced: bool = False) -> Repaired:
     """The mesh without what has no place in a surface, triangles turned that face against their neighbours.
 
     Coinciding vertices become one, triangles of vertices that are not finite, of less than three vertices, or there
     twice are left out. Holes are closed with a fan around the middle of their rim where `HOLE_SHARE` calls them small.
-    Raises DataError where no triangle with an area is left.
+    as_faced: the way that a closed surface faces is meant, as one's from a volume; else it is turned to face outwards,
+    piece by piece. Raises DataError where no triangle with an area is left.
     """
     vertices, cells = _usable(mesh)
     cells = _facing_one_way(vertices, cells)
     vertices, cells = _closed_over(vertices, cells)
     cells = _without_debris(vertices, cells)
     border = _border(vertices, cells)
+    inside_out = False
+    if not len(border) and not as_faced:
+        cells = _facing_outwards(vertices, cells)
+    elif not len(border) and _volumes(vertices, cells).sum() < 0:
+        cells, inside_out = cells[:, ::-1], True
     # Only now: triangles without area tell what is connected to what.
     cells = cells[areas(vertices, cells) > 0]
     if not len(cells):
         raise DataError("the surface has no triangle with an area; expected a surface in three dimensions")
-    if not len(border) and _volume(vertices, cells) < 0:
-        cells = cells[:, ::-1]
-    return Repaired(vertices, np.ascontiguousarray(cells), border)
+    return Repaired(vertices, np.ascontiguousarray(cells), border, inside_out)
 
 
 def areas(vertices: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -97,6 +103,33 @@ def _facing_one_way(vertices: np.ndarray, cells: np.ndarray) -> np.ndarray:
     wrong = np.bincount(piece, area)[piece] < 0
     turned[wrong] = turned[wrong, ::-1]
     return turned
+
+
+def _facing_outwards(vertices: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Closed pieces that face inwards turned, each with all that lies within it: cavities stay cavities."""
+    import igl
+
+    piece = igl.facet_components(cells)[1]
+    volume = np.bincount(piece, _volumes(vertices, cells))
+    if (volume >= 0).all():
+        return cells
+    cells, size = cells.copy(), np.bincount(piece)
+    points, left = vertices[cells[:, 0]], np.ones(len(size), bool)
+    for outer in np.argsort(-np.abs(volume)):
+        if not left[outer]:
+            continue
+        own = piece == outer
+        low, high = points[own].min(0), points[own].max(0)
+        near = np.flatnonzero(left[piece] & ~own & np.all((points > low) & (points < high), 1))
+        if len(near):
+            around = np.abs(igl.fast_winding_number(vertices, cells[own], points[near])) > 0.5
+            near = near[around]
+        within = np.bincount(piece[near], minlength=len(size)) == size
+        within[outer] = True
+        left &= ~within
+        if volume[outer] < 0:
+            cells[within[piece]] = cells[within[piece], ::-1]
+    return cells
 
 
 def _border(vertices: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -180,6 +213,7 @@ def _pieces(count: int, cells: np.ndarray) -> np.ndarray:
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
-def _volume(vertices: np.ndarray, cells: np.ndarray) -> float:
+def _volumes(vertices: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """(C,) mm^3 below each triangle: the sum is what a closed surface holds, negative where it faces inwards."""
     a, b, c = (vertices[cells[:, k]] - vertices.mean(0) for k in range(3))
-    return float((np.cross(a, b) * c).sum() / 6)
+    return np.asarray((np.cross(a, b) * c).sum(1) / 6)

@@ -27,7 +27,7 @@ from beltrami_cli.inputs import (
     without,
 )
 from beltrami_cli.kinds import Kind, kind_of
-from beltrami_cli.observed import VertexBand
+from beltrami_cli.observed import AtVertices, VertexBand
 from beltrami_cli.places import Vertices, Voxels
 from beltrami_cli.planning import CORRELATED, Plan, Planner, Sample
 from beltrami_cli.progress import Phases
@@ -119,26 +119,38 @@ class Solver:
                 of_mesh = VertexBand(surface, axes.grid, settings.half_width(grid.used_spacing))
                 self.band = of_mesh.band
                 self.shown.append((surface, of_mesh.vertices))
-                self._tell_lost(of_mesh)
             else:
                 self.band = band_of(surface, settings, axes, warnings)
                 if surface is not None:
                     self.shown.append((surface_mesh(self.band)[0], own_vertices(self.band)))
             if at_vertices:
                 assert isinstance(surface, Mesh)
-                self.places, shape = Vertices(of_mesh), (len(surface.vertices_ras_mm),)
+                self.places, shape = Vertices(of_mesh, settings.fill), (len(surface.vertices_ras_mm),)
             else:
-                self.places = Voxels(self.band, axes, settings.extension, settings.depth, settings.outside)
+                self.places = Voxels(
+                    self.band, axes, settings.extension, settings.depth, settings.fill, settings.outside
+                )
+            if isinstance(surface, Mesh):
+                self._tell_lost(of_mesh)
             self.trust = self.places.take(trusted(weights, mask, shape, settings, warnings))
             self.shown += [(mesh, self._found(mesh)) for mesh in on]
             self.course = Course(self.band, Kind(), dt, settings.reextends_every, settings.fidelity or 0.0)
 
     def _tell_lost(self, of_mesh: VertexBand) -> None:
-        lost = int((~of_mesh.reached).sum())
-        if lost:
+        alone = np.setdiff1d(np.arange(len(of_mesh.points)), of_mesh.mesh.cells)
+        if len(alone):
             self.warnings.add(
-                f"{lost} of {len(of_mesh.reached)} vertices belong to no triangle, or lie outside of the grid: "
-                "they get no value"
+                f"{len(alone)} of {len(of_mesh.points)} vertices belong to no triangle: they get no value"
+            )
+        outside = int((~of_mesh.reached).sum()) - len(alone)
+        if outside > 0:
+            self.warnings.add(
+                f"{outside} of {len(of_mesh.points)} vertices lie outside of the volume: they get no value"
+            )
+        edge, widest = float(np.median(of_mesh.edge_lengths)), float(self.grid.spacing.max())
+        if isinstance(self.places, Vertices) and widest > 2 * edge:
+            self.warnings.add(
+                f"spacing: voxels of {widest:.4g} mm are wide for edges of {edge:.4g} mm: what is finer is lost"
             )
 
     def _found(self, mesh: Mesh) -> SurfacePoints:
@@ -261,8 +273,7 @@ class Solver:
         with self.phases("flow"):
             evolution, substeps = course.run(start, plan.flow, plan.schedule, observer, stop)
             values, excess = _within_range(evolution.values, start, course.kind)
-            if settings.fill is not None and not start.known.all():
-                values[:, sample.observed.beyond(start, settings.fill)] = np.nan
+            values[:, sample.observed.beyond(start)] = np.nan
         if stop is not None and not evolution.iterations:
             warnings.add("stop discrepancy: the start values are as far from the data as the noise: nothing to do")
         if stop is not None and evolution.stop_reason != "discrepancy":
@@ -271,14 +282,17 @@ class Solver:
                 "is --noise-sigma in the unit of DATA?"
             )
         with self.phases("mesh"):
-            shown = [course.kind.at_vertices(points(values, turns=course.kind.turns)) for _, points in self.shown]
+            at = [points(values, turns=course.kind.turns) for _, points in self.shown]
+            if isinstance(sample.observed, AtVertices):
+                at[0][:, sample.observed.too_far[: at[0].shape[1]]] = np.nan
         smoothness = sample.observed.smoothness_mm(), sample.observed.smoothness_mm(values)
         ran = Ran(course.kind, sample.observed, start, evolution, substeps, values, excess, smoothness)
-        out, filled = (
-            self.places.give(values, course.kind, data),
-            self.places.filled(values, start.known, sample.observed),
+        return self._result(
+            self.places.give(values, at, course.kind, data),
+            [course.kind.at_vertices(channels) for channels in at],
+            self.places.filled(values, at, start, sample.observed),
+            what_happened(settings, self.grid, band, plan, ran),
         )
-        return self._result(out, shown, filled, what_happened(settings, self.grid, band, plan, ran))
 
     def _result(self, data: np.ndarray, shown: list[np.ndarray], filled: np.ndarray, record: dict[str, Any]) -> Result:
         mesh, on = None, shown
@@ -289,9 +303,9 @@ class Solver:
     def _nothing(self, data: np.ndarray) -> Result:
         """The result for a frame without data: everything missing."""
         values = np.full((1, self.band.entries), np.nan, data.dtype)
-        out = self.places.give(values, Kind(), data)
-        shown = [np.full(len(mesh.vertices_ras_mm), np.nan, data.dtype) for mesh, _ in self.shown]
-        return self._result(out, shown, np.zeros(data.shape, bool), {})
+        at = [np.full((1, len(mesh.vertices_ras_mm)), np.nan, data.dtype) for mesh, _ in self.shown]
+        out = self.places.give(values, at, Kind(), data)
+        return self._result(out, [channels[0] for channels in at], np.zeros(data.shape, bool), {})
 
 
 def _within_range(values: np.ndarray, start: Extended, kind: Kind) -> tuple[np.ndarray, float]:

@@ -17,6 +17,7 @@ from beltrami_cli.errors import RefusedError
 from beltrami_cli.grid import Canonical, Grid, Volume
 from beltrami_cli.inputs import require_usable
 from beltrami_cli.levelset import crossing_box, facing, two_values, zero_surface
+from beltrami_cli.repair import repaired
 from beltrami_cli.segmentation import surface_of_labels
 from beltrami_cli.surface import Mesh
 
@@ -116,8 +117,9 @@ def read_levelset(
         mesh = surface_of(_continued(source, beyond, "reflect", reflect_type="odd"))
     else:
         mesh = source
-    grid = place.grid if place else own_grid(mesh, spacing[0] if spacing else None, margin)
-    psi = signed_distance(mesh, grid)
+    surface = repaired(mesh, as_faced=not formats.is_surface(path))  # one made from a volume faces as it is meant to
+    grid = place.grid if place else own_grid(surface, spacing[0] if spacing else None, margin)
+    psi = signed_distance(surface, grid)
     if np.isnan(psi).any():
         notes.append(f"{path}: the surface has a border: its level set is NaN beyond it, and far from the surface")
     return LevelSet(Volume(psi, grid, (), place.header if place else None), tuple(dict.fromkeys(notes)))

@@ -9,6 +9,13 @@ import numpy as np
 from beltrami_cli.errors import DataError, RefusedError
 
 
+def edges_of(cells: np.ndarray) -> np.ndarray:
+    """(N, 2) edges of triangles (C, 3), each once, its smaller vertex first, in order."""
+    ends = np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1).astype(np.int64)
+    count = int(ends.max(initial=0)) + 1
+    return np.stack(np.divmod(np.unique(ends[:, 0] * count + ends[:, 1]), count), 1)
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangulated surface, or a polyline where the surface is a curve in a plane.

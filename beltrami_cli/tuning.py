@@ -92,7 +92,7 @@ def hold_out(observed: Observed, seed: int) -> np.ndarray:
     valid, count = observed.can_hold_out()
     if count < LEAST_HELD:
         raise DataError(
-            f"automatic choice: found {len(valid)} valid {observed.places} beside the surface, of which to hold out "
+            f"automatic choice: found {len(valid)} valid {observed.noun} beside the surface, of which to hold out "
             f"{count}; expected at least {LEAST_HELD}; give --beta and --iterations"
         )
     return np.sort(np.random.default_rng(seed).choice(valid, count, replace=False))
@@ -251,6 +251,6 @@ def _near(observed: Observed, rule: str) -> np.ndarray:
     near = observed.near()
     if not len(near):
         raise DataError(
-            f"stop {rule}: found no valid {observed.places} within half a voxel of the surface; give --iterations"
+            f"stop {rule}: found no valid {observed.noun} within half a voxel of the surface; give --iterations"
         )
     return near

@@ -11,8 +11,8 @@ import numpy as np
 
 from beltrami_cli import formats
 from beltrami_cli.config import Settings
-from beltrami_cli.errors import DataError
-from beltrami_cli.grid import Grid, Volume
+from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.grid import Grid, Volume, extent
 from beltrami_cli.inputs import Warnings, without
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.record import provenance, sha256, sidecar_of, write_record
@@ -84,6 +84,10 @@ def sample(job: Sampling, *, notify: Callable[[str], None] | None = None) -> dic
 
 def _read_volume(job: Sampling, warnings: Warnings) -> Volume:
     volume = formats.read_volume(job.volume, spacing=job.spacing, channels=job.kind == "vector")
+    if 1 in volume.grid.shape:
+        raise RefusedError(f"{job.volume}: is a plane; expected a volume around a surface")
+    parts = 2 if np.iscomplexobj(volume.data) else 1
+    formats.require_overlay_writable(job.output, parts * volume.channels)
     for note in volume.notes:
         warnings.add(note)
     return volume.with_data(without(volume.data, job.missing))
@@ -102,7 +106,7 @@ def _counted(
     """How many vertices there are, have a value, and lie outside the volume; raises DataError where none has one."""
     total = len(values)
     found = int(np.isfinite(values.reshape(total, -1)).any(1).sum())
-    where = f"vertices within {_extent(mesh.vertices_ras_mm)}, voxels within {_extent(grid.corners())} (RAS)"
+    where = f"vertices within {extent(mesh.vertices_ras_mm)}, voxels within {extent(grid.corners())} (RAS)"
     remedy = "are both of one space? --frame tkr or scanner says which coordinates those of the surface are"
     if found == 0:
         here = "none lies in the volume" if inside == 0 else f"the {inside} in the volume meet missing values only"
@@ -115,11 +119,6 @@ def _counted(
             f"{where}; {remedy}"
         )
     return {"vertices": total, "with_value": found, "outside_volume": total - inside}
-
-
-def _extent(ras_mm: np.ndarray) -> str:
-    ends = zip(ras_mm.min(0), ras_mm.max(0), strict=True)
-    return " x ".join(f"{low:.1f}..{high:.1f}" for low, high in ends) + " mm"
 
 
 def _record(

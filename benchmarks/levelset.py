@@ -15,6 +15,7 @@ from beltrami_cli.band import build_band
 from beltrami_cli.distance import HALF_WIDTH, signed_distance
 from beltrami_cli.formats import read_surface, read_volume
 from beltrami_cli.grid import Grid
+from beltrami_cli.repair import repaired
 from beltrami_cli.surface import Mesh
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -38,9 +39,10 @@ def folded(vertices: int = 60_000) -> Mesh:
 def sphere_error(radius: float) -> float:
     """Greatest error in voxels within the band, of an icosphere of 41,000 vertices."""
     made, centre = icosphere(subdivisions=6), np.array([radius + 8.137, radius + 8.4, radius + 7.9])
+    mesh = Mesh(np.array(made.vertices) * radius + centre, np.array(made.faces, np.int32))
     side = int(2 * radius + 17)
     grid = Grid.from_spacing((side, side, side))
-    psi = signed_distance(Mesh(np.array(made.vertices) * radius + centre, np.array(made.faces, np.int32)), grid)
+    psi = signed_distance(repaired(mesh), grid)
     true = np.linalg.norm(np.stack(np.indices(grid.shape), -1) - centre, axis=-1) - radius
     return float(np.abs(psi - np.clip(true, -HALF_WIDTH, HALF_WIDTH)).max())
 
@@ -49,7 +51,7 @@ def agreement(name: str, surface: str) -> None:
     given = read_volume(SHARED / name / "psi.nii.gz")
     mesh = read_surface(SHARED / name / f"{surface}.surf.gii")
     start = time.perf_counter()
-    psi = signed_distance(mesh, given.grid)
+    psi = signed_distance(repaired(mesh), given.grid)
     seconds = time.perf_counter() - start
     h = given.grid.spacing.max()
     band = np.isfinite(psi) & (np.abs(given.data) < BAND * h)
@@ -70,7 +72,7 @@ def main() -> None:
     seconds = []
     for _ in range(REPEATS):
         start = time.perf_counter()
-        signed_distance(mesh, grid)
+        signed_distance(repaired(mesh), grid)
         seconds.append(time.perf_counter() - start)
     print(f"folded surface, {len(mesh.vertices_ras_mm)} vertices onto 100^3: {min(seconds):.2f} s")
     for radius in (8.0, 20.0, 40.0):

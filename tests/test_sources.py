@@ -179,6 +179,20 @@ def test_of_a_mask(tmp_path):
     assert not np.isnan(psi).any()
 
 
+@pytest.mark.parametrize("shape", [SHAPE, (22, 22, 3)])
+def test_which_side_is_inside_is_kept(tmp_path, shape):
+    """Of labels and of a level set, whole or cut off by their volume."""
+    part = (slice(None), slice(None), slice(9, 9 + shape[2]) if shape[2] == 3 else slice(None))
+    rim = nifti(tmp_path / "rim.nii.gz", shells()[part].astype(np.int16))
+    ball_inside = made(rim, labels="2,3")
+    assert np.array_equal(made(rim, labels="0,1"), -ball_inside)
+    assert np.array_equal(made(rim, between="0+1,2"), -made(rim, between="2,0+1"))
+    psi = ball(SHAPE, 6.0)[part]
+    one, other = (made(nifti(tmp_path / f"{sign}.nii.gz", (sign * psi).astype(np.float32))) for sign in (1, -1))
+    assert np.array_equal(other > 0, psi < 0)
+    assert np.abs(one + other).max() < 0.05
+
+
 def test_of_a_mask_that_its_volume_cuts_off(tmp_path):
     """The surface goes on beyond the faces of the volume: both sides are known up to them."""
     mask = np.broadcast_to(ball((22, 22), 6.0)[:, :, None] < 0, (22, 22, 3))

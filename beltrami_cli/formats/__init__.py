@@ -19,8 +19,10 @@ from beltrami_cli.formats.overlays import (
     is_overlay,
     overlay_files,
     overlay_format,
+    overlay_structure,
     read_maps,
     read_overlay,
+    require_overlay_writable,
     write_overlay,
 )
 from beltrami_cli.formats.series import Series, counted
@@ -35,6 +37,7 @@ __all__ = [
     "Series",
     "Stage",
     "input_files",
+    "is_npy",
     "is_overlay",
     "is_surface",
     "mesh_beside",
@@ -43,6 +46,7 @@ __all__ = [
     "open_series",
     "overlay_files",
     "overlay_format",
+    "overlay_structure",
     "parse_structure",
     "read_grid",
     "read_layout",
@@ -51,6 +55,7 @@ __all__ = [
     "read_surface",
     "read_volume",
     "require_file",
+    "require_overlay_writable",
     "require_writable",
     "stem",
     "structure_of_name",
@@ -88,6 +93,11 @@ def volume_format(path: Path) -> str:
 def mesh_format(path: Path) -> str:
     """GIFTI, PLY, OBJ, STL, GLB or VTK, by suffix; raises RefusedError, with the known ones, for another suffix."""
     return _by_suffix(Path(path), _MESHES, "mesh")
+
+
+def is_npy(path: Path) -> bool:
+    """True for the one format that does not hold its spacing."""
+    return Path(path).suffix.lower() == ".npy"
 
 
 def stem(path: Path) -> Path:
@@ -154,18 +164,21 @@ def open_series(
     found = _look(path, spacing, dtype, True, plane)
     if found.is_complex:
         raise RefusedError(
-            f"{path}: expected frames of real values; found a complex volume; drop --independent: real and imaginary "
-            "part belong together"
+            f"{path}: expected real values; found a complex volume, whose real and imaginary part belong together; "
+            "extract magnitude or phase, or, as data to denoise, drop --independent"
         )
     return found
 
 
 def input_files(path: Path) -> list[Path]:
-    """Every file that is read for this path: both of a pair of header and voxels; a surface or vertex data alone."""
+    """Every file that is read for this path: both of a pair of header and voxels; a surface or vertex data alone.
+
+    Raises RefusedError where it is missing or none of these.
+    """
     path = Path(path)
     if is_surface(path) or is_overlay(path):
         return [path]
-    match volume_format(path):
+    match _readable_format(path):
         case "NIfTI":
             return nifti.files(path)
         case "MetaImage":
@@ -302,9 +315,21 @@ def _by_suffix(path: Path, known: dict[str, str], what: str) -> str:
     raise RefusedError(f"{path}: not the suffix of a {what}; expected one of {' '.join(known)}")
 
 
-def _require_readable(path: Path, spacing: float | Sequence[float] | None) -> str:
-    kind = volume_format(path)
+def _readable_format(path: Path) -> str:
+    """As `volume_format`; raises RefusedError, saying what it is, for what cannot be read as a volume."""
     checks.require_file(path)
+    try:
+        return volume_format(path)
+    except RefusedError:
+        if is_surface(path):
+            raise RefusedError(f"{path}: is a surface; expected a volume: are the arguments swapped?") from None
+        if is_overlay(path):
+            raise RefusedError(f"{path}: holds values at vertices; expected a volume") from None
+        raise
+
+
+def _require_readable(path: Path, spacing: float | Sequence[float] | None) -> str:
+    kind = _readable_format(path)
     if spacing is not None and kind != "NPY":
         raise RefusedError(f"{path}: {kind} has its own spacing; --spacing is for .npy only")
     return kind

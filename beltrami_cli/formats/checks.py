@@ -55,7 +55,7 @@ def require_file(path: Path) -> None:
     if not path.exists():
         raise RefusedError(f"{path}: no such file; check the path")
     if not path.is_file():
-        raise RefusedError(f"{path}: not a file; expected a volume or a surface, not a folder or a device")
+        raise RefusedError(f"{path}: is a {'folder' if path.is_dir() else 'device'}; expected a file")
     try:
         path.open("rb").close()
     except OSError as error:
@@ -85,8 +85,8 @@ def layout(
         )
     if several and not channels:
         raise RefusedError(
-            f"{path}: expected one number per voxel; found {_several(axes, per_voxel)}; extract one, or, as data to "
-            "denoise, give --kind vector (all together; with --independent one after another)"
+            f"{path}: expected one number per voxel; found {_several(axes, per_voxel)}; extract one, or, as data that "
+            "denoise or sample takes, keep all with --kind vector"
         )
     nx, ny, nz = (*axes, 1)[:3]
     if is_row(axes):
@@ -120,8 +120,8 @@ def require_numbers(path: Path, dtype: np.dtype, count: int, *, channels: bool =
     """Raise RefusedError unless voxels of this type are real numbers, or, with `channels`, one complex number each."""
     if dtype.kind == "c" and not channels:
         raise RefusedError(
-            f"{path}: expected real values; found complex ones ({dtype}); extract magnitude or phase, or, as data to "
-            "denoise, give --kind vector (real and imaginary part together)"
+            f"{path}: expected real values; found complex ones ({dtype}); extract magnitude or phase, or, as data that "
+            "denoise or sample takes, keep real and imaginary part with --kind vector"
         )
     if dtype.kind == "c" and count > 1:
         raise RefusedError(

@@ -27,13 +27,15 @@ class StoredSurface:
 
     vertices: (V, 3) float64 mm in the frame of the file. cells: (C, 3) int32.
     frame: what the file says of that frame, "scanner" or "tkr"; None where it says nothing.
+    unsaid: what it is then taken for; None where it could as well be the other, once a volume is involved.
     tkr_to_scanner: (4, 4), from the volume geometry in the file; None where it has none.
     structure: as `Mesh.structure`.
     """
 
     vertices: np.ndarray
     cells: np.ndarray
-    frame: str | None = "scanner"
+    frame: str | None = None
+    unsaid: str | None = "scanner"
     tkr_to_scanner: np.ndarray | None = None
     structure: str | None = None
 
@@ -77,17 +79,21 @@ def _torig(shape: np.ndarray, spacing: np.ndarray) -> np.ndarray:
 
 def _matrix(path: Path, stored: StoredSurface, frame: str | None, like: Grid | None) -> np.ndarray | None:
     """From the file's frame to the scanner's, None where they are one."""
-    require_frame(frame)
-    if (frame or stored.frame) == "tkr":
+    if frame == "tkr" and stored.frame == "scanner" and stored.tkr_to_scanner is None:
+        raise RefusedError(
+            f"{path}: says that its vertices are in scanner RAS or in a template's space; found --frame tkr; drop it"
+        )
+    frame = frame or stored.frame or stored.unsaid
+    if frame == "tkr":
         if stored.tkr_to_scanner is not None:
             return _usable(path, stored.tkr_to_scanner)
         if like is None:
             raise RefusedError(
-                f"{path}: --frame tkr needs the volume that the surface was made from, and the file does not describe "
-                "it; name a volume too (--like), or convert it with mris_convert --to-scanner"
+                f"{path}: --frame tkr needs the volume that the surface was made from, which the file does not "
+                "describe; give that volume too, or drop --frame: without a volume the vertices stay where they are"
             )
         return like.affine @ np.linalg.inv(_torig(np.array(like.shape), like.spacing))
-    if frame is None and stored.frame is None and like is not None:
+    if frame is None and like is not None:
         raise RefusedError(
             f"{path}: does not say where its vertices are in the volume (no valid volume info); give --frame tkr where "
             "they are in FreeSurfer's surface RAS of this volume, --frame scanner where they are in its world"

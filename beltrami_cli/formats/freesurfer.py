@@ -57,7 +57,7 @@ def read_surface(path: Path) -> StoredSurface:
         start += 8 + vertices.nbytes
         cells = np.frombuffer(content, ">i4", 3 * cell_count, start).reshape(-1, 3)
         frame, matrix = _footer(content[start + cells.nbytes :])
-    return StoredSurface(vertices.astype(float), cells.astype(np.int32), frame, matrix)
+    return StoredSurface(vertices.astype(float), cells.astype(np.int32), frame, unsaid=None, tkr_to_scanner=matrix)
 
 
 def read_morph(path: Path) -> np.ndarray:

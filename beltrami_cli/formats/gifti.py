@@ -63,7 +63,7 @@ def read_surface(path: Path) -> StoredSurface:
         )
     frame, matrix = _frame(points[0])
     structure = structure_of_text(points[0].meta.get(_STRUCTURE) or image.meta.get(_STRUCTURE))
-    return StoredSurface(vertices, cells.astype(np.int32), frame, matrix, structure)
+    return StoredSurface(vertices, cells.astype(np.int32), frame, tkr_to_scanner=matrix, structure=structure)
 
 
 def read_maps(path: Path, vertices: int | None = None) -> dict[str, np.ndarray]:
@@ -86,6 +86,13 @@ def read_maps(path: Path, vertices: int | None = None) -> dict[str, np.ndarray]:
     if not maps:
         raise RefusedError(f"{path}: expected values at vertices; found a surface; give it in the level set's place")
     return maps
+
+
+def read_structure(path: Path) -> str | None:
+    """What the file, or the first of its arrays that does, says of its structure; raises DataError."""
+    image = _load(path)
+    said = (structure_of_text(part.meta.get(_STRUCTURE)) for part in (image, *image.darrays))
+    return next(filter(None, said), None)
 
 
 def write(path: Path, mesh: Mesh) -> None:
@@ -121,15 +128,15 @@ def _load(path: Path) -> Any:
         return gifti.GiftiImage.from_filename(path, mmap=False)
 
 
-def _frame(points: Any) -> tuple[str, np.ndarray | None]:
-    """The frame of the vertices, and the way from tkr to scanner RAS where the file tells it."""
+def _frame(points: Any) -> tuple[str | None, np.ndarray | None]:
+    """The frame of the vertices and the way from tkr to scanner RAS, each None where the file does not tell it."""
     space, geometry = points.coordsys, _volume_geometry(points.meta)
     if space is not None and space.dataspace != _UNKNOWN:
         return "scanner", None if geometry is None else geometry[0]
     if space is not None and space.xformspace in (_SCANNER, _ALIGNED):
         return "tkr", np.array(space.xform, float)
     if geometry is None:
-        return "scanner", None
+        return None, None
     matrix, centre = geometry
     return ("tkr" if centre.any() else "scanner"), matrix
 

@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike
 
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.formats import checks, freesurfer, gifti
+from beltrami_cli.formats.structures import structure_of_name
 from beltrami_cli.surface import Mesh
 
 _GIFTI_METRICS = (".func.gii", ".shape.gii")
@@ -68,6 +69,30 @@ def overlay_files(path: Path) -> list[Path]:
     return [path]
 
 
+def require_overlay_writable(path: Path, channels: int) -> None:
+    """Raise RefusedError where so many values per vertex cannot be written to this path: before anything is computed.
+
+    FreeSurfer's own format holds one, the others any number.
+    """
+    path = Path(path)
+    overlay_files(path)
+    if channels > 1 and overlay_format(path) == "FreeSurfer":
+        raise RefusedError(
+            f"{path}: FreeSurfer's format holds one value per vertex; found {channels}; write .mgz or .func.gii"
+        )
+
+
+def overlay_structure(path: Path) -> str | None:
+    """Of which structure a file's values are, as `Mesh.structure`: by what GIFTI says, else by its name (lh., hemi-L).
+
+    Raises RefusedError where the file is no vertex data, DataError where it cannot be read.
+    """
+    path = Path(path)
+    kind = overlay_format(path)
+    checks.require_file(path)
+    return (gifti.read_structure(path) if kind == "GIFTI" else None) or structure_of_name(path)
+
+
 def read_maps(path: Path, vertices: int | None = None) -> dict[str, np.ndarray]:
     """Every map or frame of a file, (N,) as stored, by name (`map 1`, `frame 1` ... where it has none).
 
@@ -108,13 +133,13 @@ def read_overlay(
 def write_overlay(
     path: Path, values: np.ndarray, *, structure: str | None = None, dtype: DTypeLike = np.float32
 ) -> None:
-    """Write values (V,), or (V, K) as K maps or frames, named as those of a mesh; raises RefusedError, DataError.
+    """Write values (V,), or (V, K) as K maps or frames, named as those of a mesh.
 
     structure: for GIFTI, as `Mesh.structure`. dtype: uint8 for a mask in MGH; else everything is stored as float32.
-    FreeSurfer's own format holds one map. NaN is kept in every format.
+    NaN is kept in every format. Raises RefusedError as `require_overlay_writable`, DataError where writing fails.
     """
     path = Path(path)
-    overlay_files(path)
+    require_overlay_writable(path, values.shape[1] if values.ndim > 1 else 1)
     match overlay_format(path):
         case "GIFTI":
             no_geometry = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32), values)
@@ -122,11 +147,6 @@ def write_overlay(
         case "MGH":
             _write_mgh(path, values, np.uint8 if np.dtype(dtype) == np.uint8 else np.float32)
         case _:
-            if values.ndim > 1 and values.shape[1] > 1:
-                raise RefusedError(
-                    f"{path}: FreeSurfer's format holds one value per vertex; found {values.shape[1]}; write .mgz or "
-                    ".func.gii"
-                )
             freesurfer.write_morph(path, values.reshape(-1))
 
 
@@ -198,8 +218,8 @@ def _chosen(path: Path, maps: dict[str, np.ndarray], channels: bool, wanted: str
     if wanted is None:
         if len(names) > 1 and not channels:
             raise RefusedError(
-                f"{path}: expected one value per vertex; found {len(names)} maps: {listing}; choose one by name or "
-                "number with --map, or take all of them together with --kind vector"
+                f"{path}: expected one value per vertex; found {len(names)} maps: {listing}; keep one in the file, "
+                "or, as data to denoise, choose one by name or number with --map, or take all with --kind vector"
             )
         return names
     if wanted in maps:

@@ -50,7 +50,9 @@ def surface_format(path: Path) -> str:
     )
 
 
-def read_surface(path: Path, *, frame: str | None = None, like: Grid | None = None) -> Mesh:
+def read_surface(
+    path: Path, *, frame: str | None = None, like: Grid | None = None, frame_where_unsaid: bool = False
+) -> Mesh:
     """Read a surface as a mesh in scanner RAS mm, its vertices in the order of the file.
 
     frame: `scanner`, the vertices are taken as stored; `tkr`, they are in FreeSurfer's surface RAS, of the volume that
@@ -59,13 +61,15 @@ def read_surface(path: Path, *, frame: str | None = None, like: Grid | None = No
             one that says neither is taken as stored without `like`, and refused with it.
         GIFTI: the coordinate system and volume geometry, see `gifti.read_surface`.
         PLY, OBJ, STL, VTK, which say nothing: scanner.
+    frame_where_unsaid: what the file says goes before `frame`: for one option that is for several files.
     like: grid of the volume that the surface is used with. As the measure of tkr it has to be the volume that the
         surface was made from (orig.mgz, voxels in that order), not one turned to other axes.
 
     `Mesh.structure` is what the file says, else what its name says (lh., hemi-L, .L.).
 
-    Raises RefusedError where the file is no surface, or its frame is needed and unknown; DataError where it cannot be
-    read, has no triangles, coordinates that are not finite, or triangles of vertices that are not there.
+    Raises RefusedError where the file is no surface, its frame is needed and unknown, or `tkr` is asked for against
+    what the file says (scanner RAS or a template's space, and no volume geometry); DataError where it cannot be read,
+    has no triangles, coordinates that are not finite, or triangles of vertices that are not there.
     """
     path = Path(path)
     require_frame(frame)
@@ -78,6 +82,8 @@ def read_surface(path: Path, *, frame: str | None = None, like: Grid | None = No
         case _:
             stored = plain_mesh.read_surface(path, kind)
     _require_sound(path, stored)
+    if frame_where_unsaid:
+        frame = stored.frame or frame
     mesh = in_scanner_ras(path, stored, frame, like)
     return mesh if mesh.structure is not None else replace(mesh, structure=structure_of_name(path))
 
