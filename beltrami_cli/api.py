@@ -53,6 +53,8 @@ def denoise(
     for name in options.keys() - {field.name for field in fields(Settings)}:
         raise RefusedError(f"unknown option {name!r}; the options are the fields of config.Settings")
     settings = Settings(**options)
+    if isinstance(levelset, list | tuple) or (levelset is not None and hasattr(levelset, "__array__")):
+        levelset = np.asanyarray(levelset)
     if settings.flat != (levelset is None) or not isinstance(levelset, np.ndarray | Mesh | None):
         raise RefusedError(
             f"levelset: found {type(levelset).__name__}; expected an array or a Mesh, or None together with flat=True"
@@ -145,7 +147,8 @@ def _shape(values: np.ndarray, vertices: int | None, psi: np.ndarray | None, set
     axes = (2, 3) if vertices is None else (1,) if values.ndim < 3 else (3,)
     if len(shape) not in axes:
         more = " (several channels need kind='vector')" if values.ndim == 4 else ""
-        raise RefusedError(f"data: found an array of shape {values.shape}; expected {max(axes)} axes{more}")
+        wanted = " or ".join(map(str, axes))
+        raise RefusedError(f"data: found an array of shape {values.shape}; expected {wanted} axes{more}")
     if settings.independent and values.shape == shape:
         raise RefusedError(f"independent: found data of shape {values.shape}; expected several frames, (..., K)")
     return shape

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from beltrami_cli.errors import DataError
-from beltrami_cli.grid import Grid
+from beltrami_cli.grid import Grid, extent
 from beltrami_cli.kernels import sheets
 from beltrami_cli.levelset import ZeroSurface, crossing_box, zero_surface
 
@@ -102,13 +102,16 @@ def band_around(surface: ZeroSurface, grid: Grid, half_width: float) -> Band:
     ijk = surface.points / grid.spacing
     inside = np.all((ijk >= 0) & (ijk <= np.array(grid.shape) - 1), axis=1)
     if not inside.any():
-        low, high = (grid.to_world(end[None])[0] for end in (ijk.min(0), ijk.max(0)))
-        first, last = (grid.to_world(np.array([end], float))[0] for end in ((0, 0, 0), np.array(grid.shape) - 1))
         raise DataError(
-            f"the surface lies outside of the volume: found vertices from {_place(low)} to {_place(high)}, voxels from "
-            f"{_place(first)} to {_place(last)} RAS mm; expected one space (--frame says which the surface is in)"
+            f"the surface lies outside of the volume: found vertices within {extent(grid.to_world(ijk))}, voxels within "
+            f"{extent(grid.corners())} (RAS); expected one space (--frame says which the surface is in)"
         )
     margin, held = _margin(grid, half_width), ijk[inside]
+    if np.ptp(held, axis=0).max() < 1:
+        raise DataError(
+            f"the surface measures {np.ptp(surface.points, axis=0).max():.4g} mm in the volume, less than a voxel of "
+            f"{grid.spacing.max():.4g} mm; expected many voxels: is it in metres?"
+        )
     box = tuple(
         slice(max(0, int(a) - m), min(n, int(np.ceil(b)) + 1 + m))
         for a, b, m, n in zip(held.min(0), held.max(0), margin, grid.shape, strict=True)
@@ -122,10 +125,6 @@ def _margin(grid: Grid, half_width: float) -> tuple[int, ...]:
     return tuple(
         int(np.ceil(half_width / h)) + 1 if n > 1 else 0 for h, n in zip(grid.spacing, grid.shape, strict=True)
     )
-
-
-def _place(ras_mm: np.ndarray) -> str:
-    return "(" + ", ".join(f"{x:.4g}" for x in ras_mm) + ")"
 
 
 def _around(surface: ZeroSurface, grid: Grid, box: tuple[slice, ...], half_width: float) -> Band:

@@ -10,11 +10,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from beltrami_cli.errors import DataError
-from beltrami_cli.grid import Grid
+from beltrami_cli.grid import Grid, extent
 from beltrami_cli.repair import Repaired, edges
 
 # Half-width, in voxels of the largest spacing: the band of 4 of a flow, and 2 for the stencils at its edge.
 HALF_WIDTH = 6.0
+# Around a surface, in voxels: one more than that.
+MARGIN = HALF_WIDTH + 1
 # A closest point is on an edge where its barycentric coordinate says so up to rounding.
 ON_EDGE = 1e-6
 # Shares of an edge: how far beside a triangle its two sides are; how much longer than allowed rounding makes a link.
@@ -60,12 +62,12 @@ def own_grid(surface: Repaired, spacing: float | None = None, margin: float | No
 
     spacing: mm; by default the median edge, for finer voxels would say no more than a mesh does, or less where that
         takes `VOXELS_BETWEEN_BANKS` voxels between opposite banks.
-    margin: mm beyond the vertices on every side; by default the half-width of `signed_distance` and one voxel more.
+    margin: mm beyond the vertices on every side; by default `MARGIN` voxels.
 
     Raises RefusedError as `Grid.around`.
     """
     step = _resolution(surface) if spacing is None else spacing
-    around = (HALF_WIDTH + 1) * step if margin is None else margin
+    around = MARGIN * step if margin is None else margin
     return Grid.around(surface.vertices[np.unique(surface.cells)], step, around)
 
 
@@ -205,14 +207,9 @@ def _no_crossing(vertices: np.ndarray, grid: Grid) -> str:
             "expected smaller ones: give --spacing, or --like with a finer volume"
         )
     return (
-        f"the surface runs between no two voxels of the volume: found it from {_place(vertices.min(0))} to "
-        f"{_place(vertices.max(0))}, the voxels from {_place(corners.min(0))} to {_place(corners.max(0))} RAS mm; "
-        "expected one space for both (--frame says which the surface is in) and voxels smaller than the surface"
+        f"the surface runs between no two voxels of the volume: found it within {extent(vertices)}, the voxels within "
+        f"{extent(corners)} (RAS); expected one space for both (--frame says which the surface is in)"
     )
-
-
-def _place(ras_mm: np.ndarray) -> str:
-    return "(" + ", ".join(f"{x:.4g}" for x in ras_mm) + ")"
 
 
 def _resolution(surface: Repaired) -> float:

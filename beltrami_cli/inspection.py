@@ -129,7 +129,7 @@ def _frame(path: Path, mesh: Mesh) -> str:
 
 
 def describe_overlay(path: Path) -> list[str]:
-    """Lines on format, vertices, structure and values of vertex data, a line for each map; raises as `formats.read_maps`."""
+    """Lines on format, structure and the values of each map of vertex data; raises as `formats.read_maps`."""
     maps = formats.read_maps(path)
     vertices = len(next(iter(maps.values())))
     lines = [

@@ -87,7 +87,7 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
         "Removed": {
             "rms": _number(ran.kind.spread(given[:, there], left[:, there])),
             ran.observed.noun: int(there.sum()),
-            "meaning": f"input minus output at valid {ran.observed.noun} within half a voxel of the surface",
+            "meaning": f"input minus output at valid {ran.observed.noun} on the surface (voxels: within half of one)",
         },
         "ClippedExcess": ran.excess,
         "Choice": None if plan.choice is None else _chosen(plan.choice, ran.observed.noun),

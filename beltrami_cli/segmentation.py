@@ -19,9 +19,11 @@ from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.grid import Canonical, Grid
 from beltrami_cli.kernels import fairing
 from beltrami_cli.kernels import mesh as kernels
-from beltrami_cli.levelset import contour, isosurface, thin_first, two_values, zero_surface
+from beltrami_cli.levelset import contour, crossing_box, facing, isosurface, thin_first, two_values, zero_surface
 from beltrami_cli.surface import Mesh
 
+# Labels as pairs (first, last): "5-255" is one pair, "2,41" two.
+Labels = tuple[tuple[int, int], ...]
 # Times that normals, curvatures and their average are taken anew, and steps towards the minimum in between: enough to
 # round off terraces up to about 15 voxels wide; four times as many reach twice as far.
 ROUNDS, STEPS = 8, 80
@@ -33,6 +35,7 @@ AVERAGE_RINGS = 10
 MARGIN = 0.02
 # The same beside a voxel between two of the other side, as in a sulcus one voxel wide: its banks keep half of it.
 THIN_MARGIN = 0.25
+MOST_LISTED = 40  # labels in a message
 # Weight of the pull to the middle of the edge, 1/voxel^4: it only decides what curvature leaves open, as a flat face.
 PULL = 1e-4
 # An edge along the surface says nothing of its height: its vertex moves along it by 1/SLOPE of a height at most.
@@ -53,47 +56,63 @@ def surface_of_labels(
     labels: np.ndarray,
     grid: Grid,
     *,
-    labels_inside: tuple[int, ...] | None,
-    between: tuple[tuple[int, ...], tuple[int, ...]] | None,
+    labels_inside: Labels | None,
+    between: tuple[Labels, Labels] | None,
 ) -> Mesh:
     """The surface that a segmentation describes, in RAS mm, facing outwards.
 
     labels: (nx, ny, nz), NaN where unknown. labels_inside: the labels of the voxels inside; of a segmentation with two
     values the higher one, if None. between: the labels of the inner region and of the outer one, for the surface half
     way between the two (`mid_surface`); voxels with 0 are then unknown, unless 0 is named. Loose voxels and holes are
-    kept: they become small closed surfaces. Raises RefusedError where a label is absent, on both sides, or not named.
+    kept: they become small closed surfaces. Raises RefusedError where a label is absent, on both sides, or not named;
+    DataError where the labels have no boundary.
     """
     known = ~np.isnan(labels)
     if between is not None:
-        inner, outer = between
+        inner, outer = (_present(labels, side) for side in between)
         if both := sorted(set(inner) & set(outer)):
             raise RefusedError(f"the inner and the outer labels share {_listed(both)}; expected each on one side")
-        _require(labels, (*inner, *outer))
-        unsegmented = (labels == 0) & (0 not in (*inner, *outer))
-        return mid_surface(np.isin(labels, inner), np.isin(labels, outer), grid, known & ~unsegmented)
+        if 0 not in (*inner, *outer):
+            known &= labels != 0
+            _require_thickness(known)
+        return mid_surface(np.isin(labels, inner), np.isin(labels, outer), grid, known)
     if labels_inside is not None:
-        _require(labels, labels_inside)
-        return smooth_surface(np.isin(labels, labels_inside), grid, known)
+        return smooth_surface(np.isin(labels, _present(labels, labels_inside)), grid, known)
     values = two_values(labels)
     if values is None:
         raise RefusedError(
-            f"which labels are inside? found {_listed(np.unique(labels[known]))}; expected two values, or the labels "
-            "named by --labels or --between"
+            f"holds the labels {_listed(np.unique(labels[known]))}; --labels says which are inside (as in 2,41 or "
+            "5-255), or --between INNER,OUTER between which of them the surface is"
         )
     return smooth_surface(labels == values[1], grid, known)
 
 
-def _require(labels: np.ndarray, wanted: tuple[int, ...]) -> None:
-    """Raise RefusedError unless every label wanted is there."""
-    there = np.unique(labels[~np.isnan(labels)])
-    if absent := [label for label in wanted if label not in there]:
-        raise RefusedError(f"label {_listed(absent)} is not in the segmentation; found {_listed(there)}")
+def _present(labels: np.ndarray, wanted: Labels) -> tuple[int, ...]:
+    """Labels wanted, of ranges those that are there; raises RefusedError where one, or all of a range, are not."""
+    found = np.unique(labels[~np.isnan(labels)])
+    present: list[int] = []
+    for first, last in wanted:
+        there = found[(found >= first) & (found <= last)]
+        if not len(there):
+            name = f"{first}" if first == last else f"{first}-{last}"
+            raise RefusedError(f"has no label {name}; found {_listed(found)}")
+        present += there.astype(int).tolist()
+    return tuple(present)
 
 
 def _listed(labels: Sequence[float] | np.ndarray) -> str:
-    """Labels for a message, the first 40 of them."""
-    names = [f"{label:g}" for label in labels[:40]]
-    return ", ".join([*names, f"... ({len(labels)} values)"] if len(labels) > 40 else names) or "none"
+    names = ", ".join(f"{label:g}" for label in labels[:MOST_LISTED])
+    return names if len(labels) <= MOST_LISTED else f"{names} ... {labels[-1]:g} ({len(labels)} values)"
+
+
+def _require_thickness(known: np.ndarray) -> None:
+    """Raise RefusedError where the voxels known are one slice of a volume."""
+    for axis, length in enumerate(known.shape):
+        if length > 1 and np.count_nonzero(known.any(tuple(k for k in range(3) if k != axis))) == 1:
+            raise RefusedError(
+                f"its labels fill one slice across axis {axis + 1}, and a surface needs two or more (0 counts as "
+                "unknown); label the slices beside it as well, or name 0 as a side if it is one"
+            )
 
 
 def smooth_surface(inside: np.ndarray, grid: Grid, known: np.ndarray | None = None) -> Mesh:
@@ -112,8 +131,7 @@ def smooth_surface(inside: np.ndarray, grid: Grid, known: np.ndarray | None = No
     # World lengths and angles in a frame whose third axis stays a plane's normal; units of the finest voxel.
     axes = np.linalg.cholesky(grid.affine[:3, :3].T @ grid.affine[:3, :3]).T / grid.used_spacing.min()
     ijk = stairs.place(_fair(stairs, axes))
-    cells = stairs.cells if grid.handedness > 0 else np.ascontiguousarray(stairs.cells[:, ::-1])
-    return Mesh(grid.to_world(ijk), cells)
+    return Mesh(grid.to_world(ijk), facing(stairs.cells, grid))
 
 
 def mid_surface(inner: np.ndarray, outer: np.ndarray, grid: Grid, known: np.ndarray | None = None) -> Mesh:
@@ -138,8 +156,7 @@ def mid_surface(inner: np.ndarray, outer: np.ndarray, grid: Grid, known: np.ndar
     inner, outer, known = inner[box], outer[box], known[box]
     psi = _equidistance(inner, outer, known, grid, low, surfaces)
     surface = zero_surface(np.where(known, psi, np.nan), grid.spacing)
-    cells = surface.cells if grid.handedness > 0 else np.ascontiguousarray(surface.cells[:, ::-1])
-    return Mesh(grid.to_world(surface.points / grid.spacing + low), cells)
+    return Mesh(grid.to_world(surface.points / grid.spacing + low), facing(surface.cells, grid))
 
 
 def _equidistance(
@@ -299,20 +316,15 @@ def _margins(psi: np.ndarray, low: np.ndarray, axis: np.ndarray) -> tuple[np.nda
 
 def _box(inside: np.ndarray, known: np.ndarray) -> tuple[slice, ...]:
     """The part of the volume that holds every grid edge from a known voxel inside to a known one outside."""
-    ends = np.zeros(inside.shape, bool)
-    for axis in range(3):
-        a = tuple(slice(None, -1) if k == axis else slice(None) for k in range(3))
-        b = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
-        crossed = (inside[a] != inside[b]) & known[a] & known[b]
-        ends[a] |= crossed
-        ends[b] |= crossed
-    if not ends.any():
+    try:
+        return crossing_box(
+            np.where(known, np.where(inside, np.float32(-1), np.float32(1)), np.float32(np.nan)), (1, 1, 1)
+        )
+    except DataError:
         raise DataError(
             f"the segmentation has no boundary: found {np.count_nonzero(inside & known)} voxels inside and "
             f"{np.count_nonzero(~inside & known)} outside; expected some of each, side by side"
-        )
-    where = [np.flatnonzero(ends.any(tuple(m for m in range(3) if m != k))) for k in range(3)]
-    return tuple(slice(max(0, int(w[0]) - 1), int(w[-1]) + 2) for w in where)
+        ) from None
 
 
 def _spread(inside: np.ndarray, known: np.ndarray, spacing: np.ndarray) -> np.ndarray:

@@ -33,7 +33,7 @@ from beltrami_cli.planning import CORRELATED, Plan, Planner, Sample
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import Ran, over_frames, what_happened
 from beltrami_cli.sampling import SurfacePoints, own_vertices, surface_mesh, vertices_of
-from beltrami_cli.surface import Mesh
+from beltrami_cli.surface import Mesh, faces_inwards
 from beltrami_cli.tuning import discrepancy
 
 # Parts of the surface without data are worth a warning above this share of the band: below it are lone voxels.
@@ -116,6 +116,9 @@ class Solver:
             if isinstance(surface, Mesh):
                 if 1 in grid.shape:
                     raise RefusedError("data: found a plane; expected a volume around the surface, which is a mesh")
+                if settings.depth is not None and faces_inwards(surface):
+                    warnings.add("LEVELSET: the triangles of a closed surface face inwards: turned, for --depth")
+                    surface = replace(surface, cells=surface.cells[:, ::-1])
                 of_mesh = VertexBand(surface, axes.grid, settings.half_width(grid.used_spacing))
                 self.band = of_mesh.band
                 self.shown.append((surface, of_mesh.vertices))

@@ -12,26 +12,24 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from beltrami_cli import formats
-from beltrami_cli.distance import HALF_WIDTH, own_grid, signed_distance
-from beltrami_cli.errors import RefusedError
+from beltrami_cli.distance import HALF_WIDTH, MARGIN, own_grid, signed_distance
+from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.grid import Canonical, Grid, Volume
-from beltrami_cli.inputs import require_usable
+from beltrami_cli.inputs import Warnings, require_usable
 from beltrami_cli.levelset import crossing_box, facing, two_values, zero_surface
+from beltrami_cli.record import provenance, sha256, sidecar_of, write_record
 from beltrami_cli.repair import repaired
-from beltrami_cli.segmentation import surface_of_labels
+from beltrami_cli.segmentation import Labels, surface_of_labels
 from beltrami_cli.surface import Mesh
-
-# Labels as pairs (first, last): "5-255" is one pair, "2,41" two.
-Labels = tuple[tuple[int, int], ...]
-MOST_LISTED = 40  # labels in a message
 
 
 @dataclass(frozen=True)
 class LevelSet:
-    """A signed distance in mm, and lines for the user about it."""
+    """A signed distance in mm, lines for the user about it, and what it was made of and how, for a record."""
 
     volume: Volume
     notes: tuple[str, ...]
+    made: dict[str, dict[str, Any]]
 
 
 def read_source(
@@ -101,35 +99,103 @@ def read_levelset(
     _check_options(path, like, giver, spacing, margin)
     notes = list(place.notes if place else ())
     # As far as the level set reaches, so that the surface does not end where the volume does.
-    beyond = 0.0 if like or not place else (HALF_WIDTH + 1) * float(place.grid.spacing.max())
+    beyond = 0.0 if like or not place else MARGIN * float(place.grid.spacing.max())
     source = read_source(
         path,
         labels=labels,
         between=between,
         frame=frame,
         like=place.grid if place else None,
-        spacing=spacing if _is_npy(path) else None,
+        spacing=spacing if formats.is_npy(path) else None,
         notify=notes.append,
         beyond=beyond,
     )
+    was = "surface" if formats.is_surface(path) else "segmentation"
     if isinstance(source, Volume):
+        was = "level set"
         notes += source.notes
         mesh = surface_of(_continued(source, beyond, "reflect", reflect_type="odd"))
     else:
         mesh = source
-    surface = repaired(mesh, as_faced=not formats.is_surface(path))  # one made from a volume faces as it is meant to
-    grid = place.grid if place else own_grid(surface, spacing[0] if spacing else None, margin)
-    psi = signed_distance(surface, grid)
+    surface = repaired(mesh, as_faced=was != "surface")  # one made from a volume faces as it is meant to
+    if place is None:
+        grid = own_grid(surface, spacing[0] if spacing else None, margin)
+        spacing = (float(grid.spacing[0]),)
+        margin = MARGIN * spacing[0] if margin is None else margin
+    else:
+        grid = place.grid
+    half_width = HALF_WIDTH * float(grid.spacing.max())
+    psi = signed_distance(surface, grid, half_width)
     if np.isnan(psi).any():
         notes.append(f"{path}: the surface has a border: its level set is NaN beyond it, and far from the surface")
-    return LevelSet(Volume(psi, grid, (), place.header if place else None), tuple(dict.fromkeys(notes)))
+    made: dict[str, dict[str, Any]] = {
+        "Parameters": {
+            "labels": labels,
+            "between": between,
+            "frame": frame,
+            "spacing": spacing,
+            "margin": margin,
+            "half_width": half_width,
+        },
+        "Surface": {
+            "made_of": was,
+            "vertices": len(surface.vertices),
+            "triangles": len(surface.cells),
+            "closed": surface.is_closed,
+        },
+        "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
+        "Voxels": {
+            "inside": int((psi < 0).sum()),
+            "outside": int((psi >= 0).sum()),
+            "unknown": int(np.isnan(psi).sum()),
+        },
+    }
+    return LevelSet(Volume(psi, grid, (), place.header if place else None), tuple(dict.fromkeys(notes)), made)
+
+
+def write_levelset(
+    path: Path,
+    output: Path,
+    *,
+    labels: str | None = None,
+    between: str | None = None,
+    frame: str | None = None,
+    like: Path | None = None,
+    spacing: tuple[float, ...] | None = None,
+    margin: float | None = None,
+    overwrite: bool = False,
+    notify: Callable[[str], None] | None = None,
+) -> dict[str, Any]:
+    """Write what `read_levelset` gives, and a record beside it; returns the record.
+
+    notify: called with each warning. Raises as `read_levelset`, and RefusedError where an output is refused.
+    """
+    files = [*formats.volume_files(output), sidecar_of(output)]
+    roles = {path: "source"} | ({like: "like"} if like else {})
+    inputs = [file for given in roles for file in formats.input_files(given)]
+    with formats.Stage(files, overwrite=overwrite, inputs=inputs) as stage:
+        found = read_levelset(
+            path, labels=labels, between=between, frame=frame, like=like, spacing=spacing, margin=margin
+        )
+        warnings = Warnings(notify)
+        for line in found.notes:
+            warnings.add(line)
+        steps = found.volume.grid.spacing
+        if formats.is_npy(output) and not np.allclose(steps, 1):
+            warnings.add(f"{output}: keeps no voxel size; give --spacing {','.join(f'{h:.6g}' for h in steps)} with it")
+        formats.write_volume(stage.path(output), found.volume)
+        sources = [(file, sha256(file), roles.get(file)) for file in inputs]
+        record = {**found.made, **provenance(sources, files, found.made["Parameters"], warnings.lines)}
+        write_record(stage.path(files[-1]), record)
+        stage.commit()
+    return record
 
 
 def _place(path: Path, spacing: tuple[float, ...] | None) -> formats.Series:
     """Grid, header and notes of the volume whose grid the level set is to have, of any number of frames."""
     if formats.is_surface(path):
         raise RefusedError(f"--like {path}: is a surface; expected a volume, for its grid")
-    place = formats.open_series(path, spacing=spacing if _is_npy(path) else None)
+    place = formats.open_series(path, spacing=spacing if formats.is_npy(path) else None)
     require_usable(place.grid, str(path))
     if 1 in place.grid.shape:
         raise RefusedError(f"{path}: is a plane; expected a volume around a surface")
@@ -139,10 +205,12 @@ def _place(path: Path, spacing: tuple[float, ...] | None) -> formats.Series:
 def _check_options(
     path: Path, like: Path | None, giver: Path | None, spacing: tuple[float, ...] | None, margin: float | None
 ) -> None:
-    """Raise RefusedError for options without a use."""
+    """Raise RefusedError for options without a use or a sense."""
+    if margin is not None and not margin >= 0:
+        raise RefusedError(f"--margin: found {margin:g}; expected 0 mm or more")
     if margin is not None and giver:
         raise RefusedError(f"--margin is for a grid around a surface; the level set has that of {giver}; drop it")
-    if spacing and giver and not any(_is_npy(file) for file in (path, like) if file):
+    if spacing and giver and not any(formats.is_npy(file) for file in (path, like) if file):
         raise RefusedError(
             f"--spacing is for a grid around a surface, and for .npy files; the level set has the grid of {giver}; "
             "drop it"
@@ -188,42 +256,19 @@ def parse_between(given: str) -> tuple[Labels, Labels]:
 
 
 def _surface_in(path: Path, volume: Volume, wanted: Labels | None, sides: tuple[Labels, Labels] | None) -> Mesh:
-    """The surface of a segmentation; raises RefusedError where it holds no labels, or others than are asked for."""
-    data, grid = volume.data, volume.grid
+    """The surface of a segmentation; raises as `surface_of_labels`, and RefusedError where it holds no labels."""
+    data = volume.data
     found = np.unique(data[np.isfinite(data)])
     if two_values(found) is None and not np.array_equal(found, np.rint(found)):
         raise RefusedError(
             f"{path}: holds values from {found[0]:.4g} to {found[-1]:.4g} that are no whole numbers: no labels, but a "
             "level set or an image; drop --labels and --between, or give the segmentation"
         )
-    if wanted:
-        return surface_of_labels(data, grid, labels_inside=_present(path, wanted, found), between=None)
-    if sides:
-        inner, outer = (_present(path, side, found) for side in sides)
-        return surface_of_labels(data, grid, labels_inside=None, between=(inner, outer))
-    if len(found) > 2:
-        raise RefusedError(
-            f"{path}: holds the labels {_listed(found)}; --labels says which are inside (as in 2,41 or 5-255), or "
-            "--between INNER,OUTER between which of them the surface is"
-        )
-    return surface_of_labels(-data if found[0] < 0 else data, grid, labels_inside=None, between=None)
-
-
-def _present(path: Path, wanted: Labels, found: np.ndarray) -> tuple[int, ...]:
-    """Labels wanted, of ranges those that are there; raises RefusedError where one, or all of a range, are not."""
-    labels: list[int] = []
-    for first, last in wanted:
-        there = found[(found >= first) & (found <= last)]
-        if not len(there):
-            name = f"{first}" if first == last else f"{first}-{last}"
-            raise RefusedError(f"{path}: has no label {name}; found {_listed(found)}")
-        labels += there.astype(int).tolist()
-    return tuple(labels)
-
-
-def _listed(found: np.ndarray) -> str:
-    names = ", ".join(f"{label:g}" for label in found[:MOST_LISTED])
-    return names if len(found) <= MOST_LISTED else f"{names} ... {found[-1]:g} ({len(found)} values)"
+    marked_negative = not (wanted or sides) and found[0] < 0
+    try:
+        return surface_of_labels(-data if marked_negative else data, volume.grid, labels_inside=wanted, between=sides)
+    except (DataError, RefusedError) as error:
+        raise type(error)(f"{path}: {error}") from None
 
 
 def _continued(volume: Volume, mm: float, mode: Any, **options: Any) -> Volume:
@@ -236,7 +281,3 @@ def _continued(volume: Volume, mm: float, mode: Any, **options: Any) -> Volume:
     affine[:3, 3] -= affine[:3, :3] @ voxels
     a, b, c = data.shape
     return replace(volume, data=data, grid=Grid((a, b, c), affine), file_shape=())
-
-
-def _is_npy(path: Path) -> bool:
-    return Path(path).suffix.lower() == ".npy"

@@ -16,6 +16,13 @@ def edges_of(cells: np.ndarray) -> np.ndarray:
     return np.stack(np.divmod(np.unique(ends[:, 0] * count + ends[:, 1]), count), 1)
 
 
+def faces_inwards(mesh: Mesh) -> bool:
+    """True for a closed surface of triangles whose corners run clockwise seen from outside."""
+    a, b, c = (mesh.vertices_ras_mm[mesh.cells[:, k]] - mesh.vertices_ras_mm.mean(0) for k in range(3))
+    is_closed = 2 * len(edges_of(mesh.cells)) == 3 * len(mesh.cells)
+    return is_closed and float((a * np.cross(b, c)).sum()) < 0
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangulated surface, or a polyline where the surface is a curve in a plane.

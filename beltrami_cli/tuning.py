@@ -36,7 +36,7 @@ CLEAR = 3.0  # standard errors by which the chosen run must beat the start for t
 
 @dataclass(frozen=True)
 class Curve:
-    """One run of the path. errors: (n + 1,) mean squared error at the held-out voxels after 0..n iterations."""
+    """One run of the path. errors: (n + 1,) mean squared error at the held-out places after 0..n iterations."""
 
     flow: Flow
     beta: float
@@ -250,7 +250,5 @@ def decorrelated(course: Course, observed: Observed, start: Extended, flow: Flow
 def _near(observed: Observed, rule: str) -> np.ndarray:
     near = observed.near()
     if not len(near):
-        raise DataError(
-            f"stop {rule}: found no valid {observed.noun} within half a voxel of the surface; give --iterations"
-        )
+        raise DataError(f"stop {rule}: found no valid {observed.noun} on the surface; give --iterations")
     return near

@@ -47,7 +47,12 @@ def test_mesh_on_a_grid_of_its_own(tmp_path, mesh):
     assert wrote == f"wrote {tmp_path / 'psi.nii.gz'}, {tmp_path / 'psi.json'}"
     told = record(tmp_path / "psi.json")
     assert [source["Role"] for source in told["Sources"]] == ["source"]
-    assert set(told["Parameters"]) == {"labels", "between", "spacing", "margin", "frame"}
+    assert set(told["Parameters"]) == {"labels", "between", "spacing", "margin", "frame", "half_width"}
+    assert [told["Parameters"][name] for name in ("spacing", "margin")] == [[pytest.approx(0.8)], 4]
+    assert told["Parameters"]["half_width"] == pytest.approx(4.8)
+    assert told["Surface"] == {"made_of": "surface", "vertices": 2562, "triangles": 5120, "closed": True}
+    assert told["Grid"]["shape"] == list(psi.shape)
+    assert told["Voxels"] == {"inside": (psi < 0).sum(), "outside": (psi >= 0).sum(), "unknown": 0}
     n = " x ".join(map(str, psi.shape))
     assert grid.startswith(f"{n} voxels of 0.8 x 0.8 x 0.8 mm, affine [")
     assert grid.endswith(f": {(psi < 0).mean():.1%} of the voxels inside")
@@ -59,6 +64,7 @@ def test_segmentation_on_its_own_grid(tmp_path, rim):
     done("levelset", turned, "-o", tmp_path / "psi.nii.gz", "--labels", "2,3")
     assert np.array_equal(nib.load(tmp_path / "psi.nii.gz").affine, nib.load(turned).affine)
     assert np.array_equal(load(tmp_path / "psi.nii.gz") < 0, load(rim) >= 2)
+    assert record(tmp_path / "psi.json")["Surface"]["made_of"] == "segmentation"
     done("levelset", rim, "-o", tmp_path / "mid.nii.gz", "--between", "2,0")
     mid = load(tmp_path / "mid.nii.gz")
     true = ball(SHAPE, 4.5, MIDDLE)
@@ -99,7 +105,9 @@ def test_codes_of_the_grid_survive(tmp_path, mesh):
 def test_npy_keeps_no_voxel_size(tmp_path, mesh):
     run = beltrami("levelset", mesh, "-o", tmp_path / "psi.npy", "--spacing", "0.8")
     assert run.code == 0
-    assert run.err == f"beltrami: {tmp_path / 'psi.npy'}: keeps no voxel size; give --spacing 0.8,0.8,0.8 with it\n"
+    said = f"{tmp_path / 'psi.npy'}: keeps no voxel size; give --spacing 0.8,0.8,0.8 with it"
+    assert run.err == f"beltrami: warning: {said}\n"
+    assert record(tmp_path / "psi.json")["Warnings"] == [said]
 
 
 def test_an_open_surface_is_told(tmp_path, mesh):
@@ -110,7 +118,10 @@ def test_an_open_surface_is_told(tmp_path, mesh):
     half.export(tmp_path / "half.stl")
     run = beltrami("levelset", tmp_path / "half.stl", "-o", tmp_path / "psi.nii.gz")
     assert run.code == 0
-    assert "half.stl: the surface has a border" in run.err
+    assert run.err.startswith(f"beltrami: warning: {tmp_path / 'half.stl'}: the surface has a border")
+    step = record(tmp_path / "psi.json")["Grid"]["spacing_mm"][0]
+    used = record(tmp_path / "psi.json")["Parameters"]
+    assert (used["spacing"], used["margin"]) == ([step], pytest.approx(7 * step))
     assert done("levelset", tmp_path / "half.stl", "-o", tmp_path / "psi.nii.gz", "--overwrite", "-q").out == ""
 
 
@@ -132,6 +143,7 @@ def test_flows_take_it(tmp_path, mesh):
         (["--spacing", "-1"], "spacing", 2),
         (["--margin", "-1"], "expected 0 mm or more", 2),
         (["--like", "absent.nii.gz"], "no such file", 2),
+        (["--spacing", "30", "--margin", "30"], "found voxels of 30 x 30 x 30 mm around a surface of 11 x 11 x 11", 1),
         (["--like", "far.nii.gz"], "the surface runs between no two voxels", 1),
         (["--like", "s.ply"], "expected", 2),
     ],

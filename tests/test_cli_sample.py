@@ -169,8 +169,8 @@ def test_no_value_at_all_is_an_error(case):
     far = surface(out.with_name("far.surf.gii"), ball_of_points()[0] + [0, 300, 0])
     message = refused("sample", volume, far, "-o", out, code=1)
     assert message.startswith(f"{volume}: has no value at the 66 vertices of {far}: none lies in the volume; ")
-    assert "vertices within 1.8..15.8 x 273.5..287.5 x 12.8..26.8 mm" in message
-    assert "voxels within -2.5..20.0 x -30.0..-9.0 x 10.0..29.5 mm (RAS)" in message
+    assert "vertices within 1.75..15.75 x 273.5..287.5 x 12.75..26.75 mm" in message
+    assert "voxels within -2.5..20 x -30..-9 x 10..29.5 mm (RAS)" in message
     assert "--frame tkr" in message
     far.unlink()
     nifti(volume, np.full(SHAPE, np.nan, np.float32), AFFINE)
@@ -254,8 +254,15 @@ def test_surfaces_in_tkr_are_carried_to_the_volume(case):
 def test_refusals_leave_no_trace(case):
     volume, mesh, out = case
     several = nifti(out.with_name("several.nii.gz"), np.stack([field(), field()], -1), AFFINE)
+    plane = npy(out.with_name("plane.npy"), field()[:, :, 0])
+    text = out.with_name("v.txt")
+    text.write_text("1 2 3")
+    metric = out.with_name("d.func.gii")
+    nib.save(nib.gifti.GiftiImage(darrays=[nib.gifti.GiftiDataArray(np.zeros(66, np.float32))]), metric)
     before = contents(out.parent)
     for options, words in (
+        ([plane, mesh, "-o", out], "plane.npy: is a plane; expected a volume"),
+        ([several, mesh, "-o", out.with_name("lh.o"), "--kind", "vector"], f"{out.with_name('lh.o')}: FreeSurfer's"),
         ([several, mesh, "-o", out], "--kind vector"),
         ([volume, mesh, "-o", out, "--kind", "circular"], "period: missing"),
         ([volume, mesh, "-o", out, "--period", "360"], "belongs to the kind circular"),
@@ -270,7 +277,11 @@ def test_refusals_leave_no_trace(case):
         ([volume.with_name("no.nii"), mesh, "-o", out], "no such file"),
         ([volume, mesh.with_name("no.surf.gii"), "-o", out], "no such file"),
         ([volume, volume, "-o", out], "expected a surface"),
-        ([mesh, mesh, "-o", out], "not the suffix of a volume"),
+        ([mesh, volume, "-o", out], "own.surf.gii: is a surface; expected a volume: are the arguments swapped?"),
+        ([metric, mesh, "-o", out], "d.func.gii: holds values at vertices; expected a volume"),
+        ([out.parent, mesh, "-o", out], "is a folder; expected a file"),
+        ([volume.with_name("no"), mesh, "-o", out], "no such file"),
+        ([text, mesh, "-o", out], "not the suffix of a volume"),
         ([volume, mesh], "-o"),
     ):
         assert words in refused("sample", *options), options

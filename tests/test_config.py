@@ -507,6 +507,27 @@ def test_config_that_cannot_be(folder, text, words):
 
 
 @pytest.mark.parametrize(
+    "line, words",
+    [
+        ("frame = 'foo'", "frame: found 'foo'; expected scanner or tkr"),
+        ("frame = 1", "frame: found 1; expected scanner or tkr"),
+        ("map = true", "map: found True; expected a text or a whole number"),
+        ("map = ['ecc']", "map: found ['ecc']; expected a text"),
+        ("labels = [2.5]", "labels: found 2.5; expected a text"),
+        ("between = [[1], 2]", "between: found [1]; expected a text"),
+    ],
+)
+def test_input_section_that_cannot_be(folder, line, words):
+    path = config(folder, FILES + line, OUTPUT)
+    assert f"{path}: [input] {words}" in refused("denoise", "--config", path)
+
+
+def test_blanks_around_the_sign_of_on(folder):
+    path = config(folder, FILES, OUTPUT, "on = 'a.surf.gii = b.func.gii'")
+    assert make_job(read_config(path)).on == ((folder / "a.surf.gii", folder / "b.func.gii"),)
+
+
+@pytest.mark.parametrize(
     "text, word",
     [
         ("volume = 3", "name of a file"),
@@ -516,6 +537,7 @@ def test_config_that_cannot_be(folder, text, words):
         ("volume = 'o.npy'\nmesh = ['m.ply', 3]", "name of a file"),
         ("volume = 'o.npy'\nfilled = true", "name of a file"),
         ("volume = 'o.npy'\noverwrite = 1", "true or false"),
+        ("volume = 'o.npy'\nstructure = 4", "[output] structure: found 4; expected a name, as CortexLeft"),
         ("volume = 'o.npy'\noutside = ['nan']", "outside"),
         ("mesh = false", "OUT"),
     ],

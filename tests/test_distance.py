@@ -307,8 +307,8 @@ def test_partly_outside_of_the_grid(whole):
 def test_outside_of_the_grid_says_where_both_are():
     with pytest.raises(DataError, match=r"runs between no two voxels") as caught:
         psi_of(sphere(centre=CENTRE + np.array([500, 0, 0])))
-    assert "(507.6, 7.2, 7.9) to (531.6, 31.2, 31.9)" in str(caught.value)
-    assert "(0, 0, 0) to (39, 39, 39) RAS mm" in str(caught.value)
+    assert "found it within 507.6..531.6 x 7.2..31.2 x 7.9..31.9 mm" in str(caught.value)
+    assert "the voxels within 0..39 x 0..39 x 0..39 mm (RAS)" in str(caught.value)
 
 
 def test_too_small_for_the_voxels():

@@ -409,7 +409,7 @@ def test_missing_files_are_refused(tmp_path):
         with pytest.raises(RefusedError, match="no such file"):
             read_volume(tmp_path / name)
     (tmp_path / "folder.nii").mkdir()
-    with pytest.raises(RefusedError, match="not a file"):
+    with pytest.raises(RefusedError, match=r"folder\.nii: is a folder; expected a file"):
         read_volume(tmp_path / "folder.nii")
     (tmp_path / "link.nii").symlink_to(tmp_path / "gone.nii")
     with pytest.raises(RefusedError, match="a link to a file that is not there"):

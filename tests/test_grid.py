@@ -7,7 +7,7 @@ import pytest
 from twins import SPACING_MM, TWINS, volume, voxels
 
 from beltrami_cli.errors import RefusedError
-from beltrami_cli.grid import Canonical, Grid, Volume, require_same_grid
+from beltrami_cli.grid import Canonical, Grid, Volume, extent, require_same_grid
 
 
 @pytest.mark.parametrize(
@@ -68,6 +68,10 @@ def test_corners_and_how_far_apart_they_are():
     assert grid.apart(Grid(grid.shape, moved)) == pytest.approx(5)
     assert grid.apart(TWINS["LPS"]) == pytest.approx(6 * SPACING_MM[1])
     assert grid.apart(grid) == 0
+
+
+def test_extent():
+    assert extent(np.array([[1, -5.125, 0], [2.5, 11.66, 0]])) == "1..2.5 x -5.125..11.66 x 0..0 mm"
 
 
 def test_refusal_prints_both_grids():

@@ -237,11 +237,14 @@ def test_info_on_surfaces(tmp_path):
     closed = surface(tmp_path / "t.surf.gii", corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32))
     out = done("info", closed).out
     assert "closed: no border edges" in out and "structure: not told" in out
-    assert "1 vertices belong to no triangle" in out
+    assert "1 vertex of no triangle" in out
+    assert "in doubt: a surface of less than 1 mm" not in out
+    small = surface(tmp_path / "m.surf.gii", corners[:3] / 1000, np.array([[0, 2, 1]], np.int32))
+    out = done("info", small).out
+    assert "5 vertices" not in out and "3 vertices, 1 triangle, edges" in out
+    assert "in doubt: a surface of less than 1 mm; expected coordinates in mm: are they in metres?" in out
     fin = np.array([[0, 2, 1], [0, 1, 3], [1, 0, 4]], np.int32)
-    assert (
-        "1 edges are shared by more than two triangles" in done("info", surface(tmp_path / "f.gii", corners, fin)).out
-    )
+    assert "1 edge shared by more than two triangles" in done("info", surface(tmp_path / "f.gii", corners, fin)).out
 
 
 def test_info_tells_the_space_of_a_surface(tmp_path):
@@ -269,6 +272,7 @@ def test_info_on_vertex_data(tmp_path):
     assert done("info", metric).out.splitlines() == [
         str(metric),
         "  GIFTI vertex data, 25 vertices, 2 maps",
+        "  structure: not told",
         "  angle: range 0 to 24, median 12, 0 NaN, 0 infinite",
         "  depth: range 6 to 24, median 15, 5 NaN, 1 infinite",
     ]
@@ -276,13 +280,21 @@ def test_info_on_vertex_data(tmp_path):
     nothing = np.full((25, 1, 1), np.nan, np.float32)
     nib.save(nib.MGHImage(nothing, None), tmp_path / "e.mgz")
     out = done("info", tmp_path / "lh.thickness", tmp_path / "e.mgz").out
-    assert "FreeSurfer vertex data, 25 vertices, 1 map\n  map 1: range 0 to 24" in out
-    assert "MGH vertex data, 25 vertices, 1 map\n  frame 1: no finite value, 25 NaN, 0 infinite" in out
+    assert "FreeSurfer vertex data, 25 vertices, 1 map\n  structure: CortexLeft\n  map 1: range 0 to 24" in out
+    assert (
+        "MGH vertex data, 25 vertices, 1 map\n  structure: not told\n  frame 1: no finite value, 25 NaN, 0 infinite"
+        in out
+    )
     series = gifti(tmp_path / "s.func.gii", *[(values, "TIME_SERIES")] * 30)
     assert done("info", series).out.splitlines()[-1] == "  ... and 18 more"
-    assert len(done("info", series).out.splitlines()) == 15
+    assert len(done("info", series).out.splitlines()) == 16
     some = gifti(tmp_path / "p.func.gii", (np.array([3, 17], np.int32), "NODE_INDEX"), (values[:2], "SHAPE"))
     assert "range 0 to 1, median 0.5, 16 NaN" in done("info", some).out
+
+
+def test_compare_tells_vertex_data(tmp_path):
+    metric = gifti(tmp_path / "m.func.gii", (np.zeros(25, np.float32), "SHAPE"))
+    assert "m.func.gii: holds values at vertices; expected a volume" in refused("compare", metric, metric)
 
 
 def test_info_goes_on_after_a_bad_surface(tmp_path):

@@ -392,9 +392,8 @@ def test_automatic_choice(sigma):
     assert result.warnings == ()
     assert result.record["Noise"]["sd"][0] == pytest.approx(sigma, rel=0.07)
     curves = [searched(mesh, d, data, beta) for beta in (0.04, 0.08, 0.16, 0.32)]
-    assert (
-        psnr(result.data, d) >= max(map(max, curves)) - 1.0
-    )  # gaps of held-out vertices cost more on meshes this coarse: docs/method.md
+    # Of a map with details of a few edges: what is held out there cannot be told from its neighbours.
+    assert psnr(result.data, d) >= max(map(max, curves)) - 1.0
 
 
 def searched(mesh: Mesh, d: np.ndarray, data: np.ndarray, beta: float) -> list[float]:

@@ -15,9 +15,11 @@ from beltrami_cli.formats import (
     is_surface,
     overlay_files,
     overlay_format,
+    overlay_structure,
     read_maps,
     read_overlay,
     read_volume,
+    require_overlay_writable,
     stem,
     write_mesh,
     write_overlay,
@@ -67,7 +69,7 @@ def test_several_maps_come_back(tmp_path, name):
     write_overlay(path, SEVERAL)
     assert np.array_equal(read_overlay(path, COUNT, channels=True), SEVERAL, equal_nan=True)
     assert np.array_equal(read_overlay(path, COUNT, map=2), SEVERAL[:, 1], equal_nan=True)
-    with pytest.raises(RefusedError, match=r"found 3 maps: (value|frame) 1, .* 3; choose one .*--map.* --kind vector"):
+    with pytest.raises(RefusedError, match=r"found 3 maps: (value|frame) 1, .* 3; keep one in .*--map.* --kind vector"):
         read_overlay(path, COUNT)
 
 
@@ -114,6 +116,32 @@ def test_freesurfers_format_holds_one_map(tmp_path):
     with pytest.raises(RefusedError, match=r"one value per vertex; found 3; write \.mgz or \.func\.gii"):
         write_overlay(tmp_path / "lh.o", SEVERAL)
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(RefusedError, match=r"lh\.o: .* found 2; write"):
+        require_overlay_writable(tmp_path / "lh.o", 2)
+    require_overlay_writable(tmp_path / "lh.o", 1)
+    require_overlay_writable(tmp_path / "o.mgz", 2)
+    with pytest.raises(RefusedError, match="not written so"):
+        require_overlay_writable(tmp_path / "o.nii.gz", 1)
+
+
+def test_of_which_structure_values_are(tmp_path):
+    for name, structure, expected in (
+        ("lh.o.func.gii", "CortexRight", "CortexRight"),
+        ("lh.o.func.gii", None, "CortexLeft"),
+        ("o_hemi-R.shape.gii", None, "CortexRight"),
+        ("o.func.gii", None, None),
+        ("lh.o", None, "CortexLeft"),
+        ("rh.o.mgz", None, "CortexRight"),
+    ):
+        write_overlay(tmp_path / name, VALUES, structure=structure)
+        assert overlay_structure(tmp_path / name) == expected
+    path = maps(tmp_path / "a.func.gii", {"a": VALUES, "b": VALUES})
+    image = nib.load(path)
+    image.darrays[1].meta["AnatomicalStructurePrimary"] = "CORTEX_RIGHT"  # of an array
+    image.to_filename(path)
+    assert overlay_structure(path) == "CortexRight"
+    with pytest.raises(RefusedError, match="no such file"):
+        overlay_structure(tmp_path / "absent.func.gii")
 
 
 @pytest.mark.parametrize("name", ["o.nii.gz", "o.surf.gii", "o.gii", "o.label.gii"])
@@ -166,7 +194,7 @@ def test_one_map_of_many(tmp_path):
 
 def test_the_list_of_maps_stays_short(tmp_path):
     path = maps(tmp_path / "o.func.gii", {f"t{t}": VALUES for t in range(200)})
-    with pytest.raises(RefusedError, match=r"found 200 maps: t0, .*, t7 \.\.\. \(200 in all\); choose"):
+    with pytest.raises(RefusedError, match=r"found 200 maps: t0, .*, t7 \.\.\. \(200 in all\); keep"):
         read_overlay(path, COUNT)
 
 

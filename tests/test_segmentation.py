@@ -263,16 +263,16 @@ def test_banks_that_touch_stay_apart(width):
 def test_labels():
     true, grid = sphere(6, OFF_GRID[0])
     labels = np.select([true < -2, true < 1, true < 4], [2, 3, 1], 0).astype(np.int16)
-    white = surface_of_labels(labels, grid, labels_inside=(2,), between=None)
-    both = surface_of_labels(labels, grid, labels_inside=(2, 3), between=None)
-    middle = surface_of_labels(labels, grid, labels_inside=None, between=((2,), (1,)))
-    named = surface_of_labels(labels, grid, labels_inside=None, between=((2,), (0, 1)))
+    white = surface_of_labels(labels, grid, labels_inside=((2, 2),), between=None)
+    both = surface_of_labels(labels, grid, labels_inside=((2, 3),), between=None)
+    middle = surface_of_labels(labels, grid, labels_inside=None, between=(((2, 2),), ((1, 1),)))
+    named = surface_of_labels(labels, grid, labels_inside=None, between=(((2, 2),), ((0, 1),)))
     mask = surface_of_labels((labels == 2) * 7, grid, labels_inside=None, between=None)
     sizes = [np.cbrt(volume_inside(m) * 3 / 4 / np.pi) for m in (white, both, middle, named, mask)]
     np.testing.assert_allclose(sizes, [4, 7, 5.5, 5.5, 4], atol=0.12)
     holes = np.where(true > 5, np.nan, labels)
     np.testing.assert_array_equal(
-        surface_of_labels(holes, grid, labels_inside=(2,), between=None).vertices_ras_mm, white.vertices_ras_mm
+        surface_of_labels(holes, grid, labels_inside=((2, 2),), between=None).vertices_ras_mm, white.vertices_ras_mm
     )
 
 
@@ -280,14 +280,18 @@ def test_refusals():
     labels = np.zeros((5, 5, 5), np.int16)
     labels[2:4, 2:4, 2:4], labels[0] = 3, 41
     grid = Grid.from_spacing(labels.shape)
-    with pytest.raises(RefusedError, match="label 2 is not in the segmentation; found 0, 3, 41"):
-        surface_of_labels(labels, grid, labels_inside=(2, 3), between=None)
-    with pytest.raises(RefusedError, match="label 7, 8 is not"):
-        surface_of_labels(labels, grid, labels_inside=None, between=((7,), (0, 8)))
+    with pytest.raises(RefusedError, match="has no label 2; found 0, 3, 41"):
+        surface_of_labels(labels, grid, labels_inside=((2, 2), (3, 3)), between=None)
+    with pytest.raises(RefusedError, match="has no label 8"):
+        surface_of_labels(labels, grid, labels_inside=None, between=(((3, 3),), ((0, 0), (8, 8))))
     with pytest.raises(RefusedError, match="share 3; expected each on one side"):
-        surface_of_labels(labels, grid, labels_inside=None, between=((3,), (0, 3)))
-    with pytest.raises(RefusedError, match=r"which labels are inside\? found 0, 3, 41; expected two values"):
+        surface_of_labels(labels, grid, labels_inside=None, between=(((3, 3),), ((0, 3),)))
+    with pytest.raises(RefusedError, match="holds the labels 0, 3, 41; --labels says"):
         surface_of_labels(labels, grid, labels_inside=None, between=None)
+    thin = np.zeros((5, 5, 3), np.int16)
+    thin[:, :, 1], thin[:2, :, 1] = 1, 2
+    with pytest.raises(RefusedError, match="fill one slice across axis 3"):
+        surface_of_labels(thin, grid, labels_inside=None, between=(((2, 2),), ((1, 1),)))
     with pytest.raises(DataError, match="no boundary: found 125 voxels inside and 0 outside"):
         smooth_surface(np.ones((5, 5, 5), bool), grid)
     with pytest.raises(DataError, match="no boundary"):
@@ -351,7 +355,7 @@ def test_the_real_rim(shared_data):
     part = (slice(40, 84), slice(20, 64), slice(10, 54))
     labels = np.asarray(image.dataobj)[part]
     grid = Grid(labels.shape, np.asarray(image.affine, float))
-    mesh = surface_of_labels(labels, grid, labels_inside=None, between=((2,), (1,)))
-    white, outer = (surface_of_labels(labels, grid, labels_inside=(k,), between=None) for k in (2, 1))
+    mesh = surface_of_labels(labels, grid, labels_inside=None, between=(((2, 2),), ((1, 1),)))
+    white, outer = (surface_of_labels(labels, grid, labels_inside=((k, k),), between=None) for k in (2, 1))
     away = np.abs(distance(white, mesh.vertices_ras_mm) - distance(outer, mesh.vertices_ras_mm))
     assert np.percentile(away, 95) < 0.03

@@ -108,6 +108,7 @@ def test_between_two_boundaries(tmp_path, between):
     ("options", "said"),
     [
         ({"labels": "7"}, "rim.nii.gz: has no label 7; found 0, 1, 2, 3"),
+        ({"labels": "0-3"}, "rim.nii.gz: the segmentation has no boundary"),
         ({"labels": "2,10-20"}, "has no label 10-20; found 0, 1, 2, 3"),
         ({"between": "2,9"}, "has no label 9"),
         ({"between": "2+3,3"}, "share 3"),
@@ -117,7 +118,7 @@ def test_between_two_boundaries(tmp_path, between):
 )
 def test_labels_that_cannot_be(tmp_path, options, said):
     path = nifti(tmp_path / "rim.nii.gz", shells())
-    with pytest.raises(RefusedError) as caught:
+    with pytest.raises((RefusedError, DataError)) as caught:
         read_source(path, **options)
     assert said in str(caught.value)
 

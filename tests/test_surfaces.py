@@ -156,7 +156,7 @@ def test_frame_tkr_by_the_volume(tmp_path, grid, suffix):
     else:
         freesurfer.write_geometry(path, points, cells)
     assert_the_pyramid(read_surface(path, frame="tkr", like=grid), 1e-3)
-    with pytest.raises(RefusedError, match=r"--frame tkr needs the volume .*\(--like\)"):
+    with pytest.raises(RefusedError, match=r"--frame tkr needs the volume .* give that volume too, or drop --frame"):
         read_surface(path, frame="tkr")
 
 
@@ -239,6 +239,37 @@ def test_gifti_of_any_suffix_that_holds_a_surface(tmp_path):
     path = write_gifti(tmp_path / "lh.pial.gii", VERTICES, FACES)
     assert is_surface(path)
     assert_the_pyramid(read_surface(path))
+
+
+@pytest.mark.parametrize(
+    ("space", "with_geometry"), [((SCANNER, UNKNOWN, np.eye(4)), False), ((TALAIRACH, TALAIRACH, np.eye(4)), True)]
+)
+def test_frame_tkr_against_what_the_file_says(tmp_path, space, with_geometry):
+    meta = volume_geometry(CONFORMED) if with_geometry else {}
+    path = write_gifti(tmp_path / "m.surf.gii", VERTICES, FACES, space, meta)
+    if with_geometry:  # Workbench writes TALAIRACH whatever the space is: the user knows better
+        moved = read_surface(path, frame="tkr", like=CONFORMED).vertices_ras_mm - VERTICES
+        assert np.allclose(moved, volume_info(CONFORMED)["cras"], atol=1e-3)
+    else:
+        for like in (None, CONFORMED):
+            with pytest.raises(RefusedError, match=r"m\.surf\.gii: says .* scanner RAS .* found --frame tkr; drop it"):
+                read_surface(path, frame="tkr", like=like)
+    assert_the_pyramid(read_surface(path, frame="scanner", like=CONFORMED))
+    assert_the_pyramid(read_surface(path, frame="tkr", like=CONFORMED, frame_where_unsaid=True))
+
+
+def test_one_frame_for_several_files(tmp_path):
+    points, cells = tkr(CONFORMED)
+    path = tmp_path / "lh.white"
+    freesurfer.write_geometry(path, points, cells)  # says nothing
+    assert_the_pyramid(read_surface(path, frame="tkr", like=CONFORMED, frame_where_unsaid=True), 1e-3)
+    freesurfer.write_geometry(path, points, cells, volume_info=volume_info(CONFORMED))
+    assert_the_pyramid(read_surface(path, frame="scanner", like=CONFORMED, frame_where_unsaid=True), 1e-3)
+    write_mesh(tmp_path / "m.ply", Mesh(points, cells))  # neither does PLY, nor GIFTI of an unknown space
+    unknown = write_gifti(tmp_path / "m.surf.gii", points, cells)
+    for path in (tmp_path / "m.ply", unknown):
+        assert_the_pyramid(read_surface(path, frame="tkr", like=CONFORMED, frame_where_unsaid=True), 1e-3)
+        assert_the_pyramid(read_surface(path, frame="tkr", like=CONFORMED), 1e-3)
 
 
 # --- structures ---------------------------------------------------------------------------------------------------
@@ -353,7 +384,7 @@ def test_what_is_given_instead_of_a_surface(tmp_path):
     values = gifti.GiftiDataArray(np.zeros(5, np.float32), "NIFTI_INTENT_SHAPE")
     for name in ("x.surf.gii", "x.func.gii"):
         gifti.GiftiImage(darrays=[values]).to_filename(tmp_path / name)
-        with pytest.raises(RefusedError, match=r"expected a surface.*found 1 maps of values; give them as data"):
+        with pytest.raises(RefusedError, match=r"expected a surface.*found values at vertices; give them as data"):
             read_surface(tmp_path / name)
     assert not is_surface(tmp_path / "x.func.gii")
 

@@ -32,7 +32,7 @@ Shell completion: eval "$(_BELTRAMI_COMPLETE=bash_source beltrami)" (or zsh_sour
 @click.group(epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="beltrami")
 def beltrami() -> None:
-    """Denoise data that lie on a surface given as the zero level of a volume, above all maps on the folded cortex."""
+    """Denoise data that lie on a surface - a level set, a segmentation or a mesh -, above all maps on the cortex."""
 
 
 for command in (denoise, levelset, mesh, sample, phantom, compare, info, demo):
@@ -73,6 +73,6 @@ def _stop(number: int, _frame: Any) -> None:
     staging = sys.modules.get("beltrami_cli.formats.staging")  # else nothing is being written
     if staging is not None:
         staging.abandon()
-    told = "\nbeltrami: interrupted; nothing was written\n" if number == signal.SIGINT else ""
+    told = "\nbeltrami: interrupted\n" if number == signal.SIGINT else ""
     os.write(2, told.encode())
     os._exit(STOPPED[number])

@@ -42,7 +42,12 @@ class Denoise(Command):
 @click.command(cls=Denoise)
 @click.argument("inputs", nargs=-1, type=FILE, metavar="LEVELSET DATA")
 @click.option(
-    "-o", "--output", "volume", type=FILE, metavar="OUT", help="The denoised volume (.nii.gz .mha .npy .mgz)."
+    "-o",
+    "--output",
+    "volume",
+    type=FILE,
+    metavar="OUT",
+    help="The denoised volume (.nii.gz .mha .npy .mgz), or values at vertices (.func.gii .shape.gii .mgz lh.NAME).",
 )
 @click.option(
     "--mesh",
@@ -51,9 +56,9 @@ class Denoise(Command):
     help="The surface with the denoised values; may be repeated. Default: beside OUT.",
 )
 @click.option("--no-mesh", is_flag=True, default=None, help="Write no mesh.")
-@click.option("--filled", type=FILE, help="A mask of the voxels that had no value and got one.")
-@click.option("--weights", type=FILE, help="How much each voxel of DATA counts: R^2, coherence ...; 0 or more.")
-@click.option("--mask", type=FILE, help="Which voxels of DATA count: those where it is not 0. All else is missing.")
+@click.option("--filled", type=FILE, help="A mask of the voxels or vertices that had no value and got one.")
+@click.option("--weights", type=FILE, help="How much each value of DATA counts: R^2, coherence ...; 0 or more.")
+@click.option("--mask", type=FILE, help="Which values of DATA count: those where it is not 0. All else is missing.")
 @click.option(
     "--on",
     multiple=True,
@@ -69,7 +74,11 @@ class Denoise(Command):
     type=click.Choice(["scanner", "tkr"]),
     help="What the coordinates of surfaces are: scanner RAS, or FreeSurfer's surface RAS. Default: what the file says.",
 )
-@click.option("--structure", metavar="NAME", help="Of what is written, as CortexLeft. Default: what SURFACE says.")
+@click.option(
+    "--structure",
+    metavar="NAME",
+    help="The part of the brain that GIFTI outputs name, as CortexLeft. Default: what the surface or its name says.",
+)
 @click.option(
     "--spacing",
     metavar="S|SX,SY,SZ",
@@ -181,7 +190,7 @@ def denoise(inputs: tuple[Path, ...], config: Path | None, quiet: bool, verbose:
     JSON record beside OUT.
 
     LEVELSET may as well be a segmentation (a mask, or labels with --labels or --between) or a surface (.surf.gii .ply
-    .obj .stl, FreeSurfer's lh.white); DATA then may have another grid or, on a surface, be values at its vertices
+    .obj .stl .vtk, FreeSurfer's lh.white); DATA then may have another grid or, on a surface, be values at its vertices
     (.func.gii .shape.gii .mgz, FreeSurfer's lh.thickness), and OUT such a file.
 
     \b

@@ -63,32 +63,25 @@ def levelset(
     """
     import numpy as np
 
-    from beltrami_cli import formats, sources
+    from beltrami_cli import sources
     from beltrami_cli.config import parse_spacing
-    from beltrami_cli.record import provenance, sha256, sidecar_of, write_record
+    from beltrami_cli.grid import Grid
 
-    if margin is not None and not margin >= 0:
-        raise click.UsageError(f"--margin: found {margin:g}; expected 0 mm or more")
-    steps = parse_spacing(spacing) if spacing else None
-    read = [path for path in (source, like) if path]
-    files = [*formats.volume_files(output), sidecar_of(output)]
-    inputs = [file for path in read for file in formats.input_files(path)]
-    with formats.Stage(files, overwrite=bool(overwrite), inputs=inputs) as stage:
-        announce_compilation(quiet)
-        made = sources.read_levelset(
-            source, labels=labels, between=between, frame=frame, like=like, spacing=steps, margin=margin
-        )
-        for line in made.notes:
-            note(quiet, line)
-        formats.write_volume(stage.path(output), made.volume)
-        roles = {source: "source", like: "like"}
-        used = {"labels": labels, "between": between, "spacing": steps, "margin": margin, "frame": frame}
-        told = provenance([(path, sha256(path), roles.get(path)) for path in inputs], files, used, made.notes)
-        write_record(stage.path(files[-1]), told)
-        stage.commit()
-    psi, step = made.volume, made.volume.grid.spacing
-    if formats.volume_format(output) == "NPY" and not np.allclose(step, 1):
-        note(quiet, f"{output}: keeps no voxel size; give --spacing {','.join(f'{h:.6g}' for h in step)} with it")
-    say(quiet, f"wrote {', '.join(map(str, files))}")
-    say(quiet, f"{psi.grid.describe()}: {(psi.data < 0).mean():.1%} of the voxels inside")
+    announce_compilation(quiet)
+    record = sources.write_levelset(
+        source,
+        output,
+        labels=labels,
+        between=between,
+        frame=frame,
+        like=like,
+        spacing=parse_spacing(spacing) if spacing else None,
+        margin=margin,
+        overwrite=bool(overwrite),
+        notify=lambda line: note(quiet, f"warning: {line}"),
+    )
+    grid, voxels = record["Grid"], record["Voxels"]
+    inside = voxels["inside"] / sum(voxels.values())
+    say(quiet, f"wrote {', '.join(record['Outputs'])}")
+    say(quiet, f"{Grid(tuple(grid['shape']), np.array(grid['affine_ras_mm'])).describe()}: {inside:.1%} of the voxels inside")
     return 0

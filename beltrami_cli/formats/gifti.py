@@ -53,8 +53,8 @@ def read_surface(path: Path) -> StoredSurface:
     points = image.get_arrays_from_intent(_POINTSET)
     triangles = image.get_arrays_from_intent(_TRIANGLE)
     if not points or not triangles:
-        maps = len(image.darrays) - len(points) - len(triangles)
-        found = f"{maps} maps of values; give them as data, and their .surf.gii as the surface" if maps else "neither"
+        only_values = len(image.darrays) > len(points) + len(triangles)
+        found = "values at vertices; give them as data, and their .surf.gii" if only_values else "neither"
         raise RefusedError(f"{path}: expected a surface, vertices and triangles; found {found}")
     vertices, cells = np.array(points[0].data, float), np.asarray(triangles[0].data)
     if vertices.shape[1:] != (3,) or cells.shape[1:] != (3,):
