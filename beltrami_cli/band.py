@@ -103,7 +103,7 @@ def band_around(surface: ZeroSurface, grid: Grid, half_width: float) -> Band:
     inside = np.all((ijk >= 0) & (ijk <= np.array(grid.shape) - 1), axis=1)
     if not inside.any():
         raise DataError(
-            f"the surface lies outside of the volume: found vertices within {extent(grid.to_world(ijk))}, voxels within "
+            f"the surface lies outside of the volume: vertices lie within {extent(grid.to_world(ijk))}, voxels in "
             f"{extent(grid.corners())} (RAS); expected one space (--frame says which the surface is in)"
         )
     margin, held = _margin(grid, half_width), ijk[inside]

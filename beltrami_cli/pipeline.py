@@ -310,8 +310,8 @@ def _survey(job: Job) -> _Scene:
         assert surface is not None
         spacing = None if job.spacing is None else job.spacing[0]
         grid = grid_around(surface, job.settings, spacing)
-        for path in (job.volume, *([] if job.filled is None else [job.filled])):
-            formats.overlay_files(path)
+        if structure is None:
+            _require_one_hemisphere(job, surface.structure)
     else:
         if job.volume.name.lower().endswith((".func.gii", ".shape.gii")):
             raise RefusedError(
@@ -323,7 +323,8 @@ def _survey(job: Job) -> _Scene:
     if not job.settings.flat:
         job.settings.half_width(grid.used_spacing)
     like = None if at_vertices else grid
-    on = tuple(formats.read_surface(path, frame=job.frame, like=like) for path, _ in job.on)
+    on = tuple(formats.read_surface(path, frame=job.frame, like=like, frame_where_unsaid=True) for path, _ in job.on)
+    _require_room(job, at_vertices)
     header = None
     if job.resample and surface is None and job.levelset is not None:
         header = formats.open_series(job.levelset, spacing=_spacing_for(job.levelset, job.spacing)).header
@@ -341,9 +342,30 @@ def _require_sense(job: Job, at_vertices: bool) -> None:
         raise RefusedError(f"spacing: found {job.spacing}; expected one number: the band around a surface has cubes")
 
 
+def _require_one_hemisphere(job: Job, structure: str | None) -> None:
+    """Raise RefusedError where values at vertices are of another part of the brain than the surface."""
+    for path in (job.data, job.weights, job.mask):
+        found = None if path is None else formats.overlay_structure(path)
+        if found and structure and found != structure:
+            raise RefusedError(
+                f"{path}: is of {found}; found LEVELSET {job.levelset} of {structure}: give both of one, or --structure"
+            )
+
+
+def _require_room(job: Job, at_vertices: bool) -> None:
+    """Raise RefusedError where files of values at vertices cannot hold as many channels as DATA has."""
+    channels = 1
+    if job.settings.kind == "vector":
+        channels = len(formats.read_maps(job.data)) if at_vertices else formats.read_layout(job.data)[0]
+    for path in ([job.volume] if at_vertices else []) + [file for _, file in job.on]:
+        formats.require_overlay_writable(path, channels)
+    if at_vertices and job.filled is not None:
+        formats.require_overlay_writable(job.filled, 1)
+
+
 def _check_grids(job: Job, surface: Mesh | None) -> Grid:
     """The grid to compute on, from headers alone; raises RefusedError where it or the outputs' formats will not do."""
-    if job.spacing is not None and not any(_is_npy(path) for path in job.all_inputs):
+    if job.spacing is not None and not any(formats.is_npy(path) for path in job.all_inputs):
         raise RefusedError("spacing: is for .npy inputs only; found none among LEVELSET and DATA; drop --spacing")
     several = job.settings.kind == "vector"
     grids: dict[str, tuple[Path, Grid]] = {}
@@ -393,12 +415,8 @@ def _is_plane(job: Job, grid: Grid | None) -> bool:
     return job.levelset is None or (grid is not None and 1 in grid.shape)
 
 
-def _is_npy(path: Path) -> bool:
-    return path.suffix.lower() == ".npy"
-
-
 def _spacing_for(path: Path, spacing: tuple[float, ...] | None) -> tuple[float, ...] | None:
-    return spacing if _is_npy(path) else None
+    return spacing if formats.is_npy(path) else None
 
 
 def _read(job: Job, path: Path, warnings: Warnings, *, channels: bool = False, plane: bool = False) -> Volume:

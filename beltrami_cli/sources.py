@@ -25,11 +25,12 @@ from beltrami_cli.surface import Mesh
 
 @dataclass(frozen=True)
 class LevelSet:
-    """A signed distance in mm, lines for the user about it, and what it was made of and how, for a record."""
+    """A signed distance in mm, lines for the user about it; for a record the options as used, and what SOURCE was."""
 
     volume: Volume
     notes: tuple[str, ...]
-    made: dict[str, dict[str, Any]]
+    used: dict[str, Any]
+    surface: dict[str, Any]
 
 
 def read_source(
@@ -110,13 +111,11 @@ def read_levelset(
         notify=notes.append,
         beyond=beyond,
     )
-    was = "surface" if formats.is_surface(path) else "segmentation"
     if isinstance(source, Volume):
-        was = "level set"
+        was, mesh = "level set", surface_of(_continued(source, beyond, "reflect", reflect_type="odd"))
         notes += source.notes
-        mesh = surface_of(_continued(source, beyond, "reflect", reflect_type="odd"))
     else:
-        mesh = source
+        was, mesh = "surface" if formats.is_surface(path) else "segmentation", source
     surface = repaired(mesh, as_faced=was != "surface")  # one made from a volume faces as it is meant to
     if place is None:
         grid = own_grid(surface, spacing[0] if spacing else None, margin)
@@ -128,29 +127,13 @@ def read_levelset(
     psi = signed_distance(surface, grid, half_width)
     if np.isnan(psi).any():
         notes.append(f"{path}: the surface has a border: its level set is NaN beyond it, and far from the surface")
-    made: dict[str, dict[str, Any]] = {
-        "Parameters": {
-            "labels": labels,
-            "between": between,
-            "frame": frame,
-            "spacing": spacing,
-            "margin": margin,
-            "half_width": half_width,
-        },
-        "Surface": {
-            "made_of": was,
-            "vertices": len(surface.vertices),
-            "triangles": len(surface.cells),
-            "closed": surface.is_closed,
-        },
-        "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
-        "Voxels": {
-            "inside": int((psi < 0).sum()),
-            "outside": int((psi >= 0).sum()),
-            "unknown": int(np.isnan(psi).sum()),
-        },
-    }
-    return LevelSet(Volume(psi, grid, (), place.header if place else None), tuple(dict.fromkeys(notes)), made)
+    used = {"labels": labels, "between": between, "frame": frame, "spacing": spacing, "margin": margin}
+    return LevelSet(
+        Volume(psi, grid, (), place.header if place else None),
+        tuple(dict.fromkeys(notes)),
+        {**used, "half_width": half_width},
+        {"made_of": was, "vertices": len(mesh.vertices_ras_mm), "closed": surface.is_closed},
+    )
 
 
 def write_levelset(
@@ -180,15 +163,28 @@ def write_levelset(
         warnings = Warnings(notify)
         for line in found.notes:
             warnings.add(line)
-        steps = found.volume.grid.spacing
-        if formats.is_npy(output) and not np.allclose(steps, 1):
-            warnings.add(f"{output}: keeps no voxel size; give --spacing {','.join(f'{h:.6g}' for h in steps)} with it")
+        if formats.is_npy(output) and not np.allclose(found.volume.grid.spacing, 1):
+            steps = ",".join(f"{h:.6g}" for h in found.volume.grid.spacing)
+            warnings.add(f"{output}: keeps no voxel size; give --spacing {steps} with it")
         formats.write_volume(stage.path(output), found.volume)
-        sources = [(file, sha256(file), roles.get(file)) for file in inputs]
-        record = {**found.made, **provenance(sources, files, found.made["Parameters"], warnings.lines)}
+        read = [(file, sha256(file), roles.get(file)) for file in inputs]
+        record = provenance(read, files, found.used, warnings.lines) | _described(found)
         write_record(stage.path(files[-1]), record)
         stage.commit()
     return record
+
+
+def _described(found: LevelSet) -> dict[str, Any]:
+    psi, grid = found.volume.data, found.volume.grid
+    return {
+        "Surface": found.surface,
+        "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
+        "Voxels": {
+            "inside": int((psi < 0).sum()),
+            "outside": int((psi >= 0).sum()),
+            "unknown": int(np.isnan(psi).sum()),
+        },
+    }
 
 
 def _place(path: Path, spacing: tuple[float, ...] | None) -> formats.Series:

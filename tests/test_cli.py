@@ -463,7 +463,7 @@ AWAY = np.where(np.abs(ball()) < 3, NAN, noisy())  # data that do not reach the 
 
 UNUSABLE = {
     "missing": (2, "no such file", lambda folder: folder / "nothing.nii.gz"),
-    "a folder": (2, "not the suffix", lambda folder: folder),
+    "a folder": (2, "is a folder", lambda folder: folder),
     "no suffix": (2, "not the suffix", lambda folder: text(folder / "disk")),
     "truncated": (1, "copied or downloaded whole", lambda f: cut_short(nifti(f / "cut.nii.gz", noisy()))),
     "truncated plain": (1, "copied or downloaded whole", lambda f: cut_short(nifti(f / "cut.nii", noisy()))),

@@ -50,7 +50,7 @@ def test_mesh_on_a_grid_of_its_own(tmp_path, mesh):
     assert set(told["Parameters"]) == {"labels", "between", "spacing", "margin", "frame", "half_width"}
     assert [told["Parameters"][name] for name in ("spacing", "margin")] == [[pytest.approx(0.8)], 4]
     assert told["Parameters"]["half_width"] == pytest.approx(4.8)
-    assert told["Surface"] == {"made_of": "surface", "vertices": 2562, "triangles": 5120, "closed": True}
+    assert told["Surface"] == {"made_of": "surface", "vertices": 2562, "closed": True}
     assert told["Grid"]["shape"] == list(psi.shape)
     assert told["Voxels"] == {"inside": (psi < 0).sum(), "outside": (psi >= 0).sum(), "unknown": 0}
     n = " x ".join(map(str, psi.shape))

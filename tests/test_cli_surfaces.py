@@ -301,3 +301,67 @@ def test_a_config_of_surfaces(folder):
     assert np.array_equal(values(Path("c.func.gii")), values(Path("o.func.gii")))
     assert np.allclose(values(Path("c.on.func.gii")), values(Path("o.func.gii")), atol=1e-3)
     assert nib.load("c.surf.gii").meta["AnatomicalStructurePrimary"] == "CortexRight"
+
+
+def test_hemispheres_are_not_mixed(folder):
+    write_overlay(folder / "right.func.gii", NOISY, structure="CortexRight")
+    message = refused("denoise", "lh.surf.gii", "right.func.gii", "-o", "o.func.gii", *L2)
+    assert "CortexRight" in message and "CortexLeft" in message
+    done("denoise", "lh.surf.gii", "right.func.gii", "-o", "o.func.gii", "--structure", "right", *L2)
+
+
+def test_channels_that_a_format_cannot_hold_are_refused_before_the_run(folder):
+    write_overlay(folder / "two.func.gii", np.stack([NOISY, NOISY], -1))
+    message = refused("denoise", "lh.surf.gii", "two.func.gii", "-o", "lh.o", "--kind", "vector")
+    assert message.startswith("lh.o: ") and ".func.gii" in message
+    nifti(folder / "two.nii.gz", np.stack([VOLUME, VOLUME], -1))
+    message = refused(
+        "denoise", "psi.nii.gz", "two.nii.gz", "-o", "o.nii.gz", "--kind", "vector", "--on", "lh.white=lh.o"
+    )
+    assert message.startswith("lh.o: ")
+
+
+def test_one_map_as_a_series(folder):
+    done("denoise", "lh.surf.gii", "lh.map", "-o", "s.func.gii", "--kind", "vector", "--independent", *L2)
+    done("denoise", "lh.surf.gii", "lh.map", "-o", "o.func.gii", *L2)
+    assert np.array_equal(values(Path("s.func.gii")), values(Path("o.func.gii")))
+
+
+def test_planes_and_labels(folder):
+    plane = nifti(folder / "plane.nii.gz", (ball((32, 32), 10) < 0).astype(np.uint8)[..., None])
+    data = nifti(folder / "flat.nii.gz", np.random.default_rng(0).normal(size=(32, 32, 1)).astype(np.float32))
+    message = refused("denoise", plane, data, "-o", "o.nii.gz", "--labels", 1)
+    assert "plane" in message and "labels" in message
+    message = refused("denoise", "lh.surf.gii", data, "-o", "o.nii.gz")
+    assert "plane" in message
+
+
+def test_headers_survive_resampling_onto_a_segmentation(folder):
+    mask = nib.Nifti1Image((ball(SHAPE, RADIUS, (CENTRE,) * 3) < 0).astype(np.uint8), np.eye(4))
+    mask.header["descrip"] = b"mine"
+    mask.set_sform(np.eye(4), code=4)
+    nib.save(mask, "mask.nii.gz")
+    shifted = np.eye(4)
+    shifted[:3, 3] = 0.3
+    nifti(folder / "shifted.nii.gz", VOLUME, shifted)
+    done("denoise", "mask.nii.gz", "shifted.nii.gz", "-o", "o.nii.gz", "--resample", *L2)
+    out = nib.load("o.nii.gz")
+    assert int(out.header["sform_code"]) == 4 and out.header["descrip"].tobytes().startswith(b"mine")
+    assert np.allclose(out.affine, np.eye(4))
+
+
+def test_a_surface_that_faces_inwards_is_turned_for_depth(folder):
+    write_mesh(folder / "lh.in.surf.gii", Mesh(MESH.vertices_ras_mm, MESH.cells[:, ::-1]))
+    radius = np.sqrt(((np.indices(SHAPE) - CENTRE) ** 2).sum(0))
+    nifti(folder / "radius.nii.gz", radius.astype(np.float32))
+    run = beltrami("denoise", "lh.in.surf.gii", "radius.nii.gz", "-o", "o.nii.gz", "--depth", "0:2", *L2)
+    assert run.code == 0 and "face inwards" in run.err
+    assert np.abs(values(Path("o.func.gii")) - RADIUS - 1).max() < 0.1
+
+
+def test_surfaces_of_another_unit_are_told(folder):
+    write_mesh(folder / "metres.surf.gii", Mesh(MESH.vertices_ras_mm / 1000 + 10, MESH.cells))
+    message = refused("denoise", "metres.surf.gii", "data.nii.gz", "-o", "o.nii.gz", *L2, code=1)
+    assert "metres" in message
+    run = beltrami("denoise", "lh.surf.gii", "lh.map", "-o", "o.func.gii", "--spacing", "5", *L2)
+    assert run.code == 0 and "spacing: voxels of 5 mm" in run.err

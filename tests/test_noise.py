@@ -26,6 +26,7 @@ from beltrami_cli.noise import (
     smoothness_mm,
     smoothness_on_mesh,
 )
+from beltrami_cli.surface import edges_of
 
 DEGREES = Kind("circular", period=360.0)
 RADIUS = 14.0
@@ -342,14 +343,14 @@ def test_noise_at_vertices_channels_and_untold(mesh_scene):
 def test_width_at_vertices(mesh_scene):
     """Of white noise none, and of white noise under a Gaussian kernel the kernel's."""
     cells, points, _, noise = mesh_scene
-    assert smoothness_on_mesh(points, cells, noise[None], Kind()) < 0.35  # edges are 0.5 mm
+    assert smoothness_on_mesh(points, edges_of(cells), noise[None], Kind()) < 0.35  # edges are 0.5 mm
     apart, near = cKDTree(points).query(points, k=60)
     for fwhm in (1.0, 1.6):
         weights = np.exp(-4 * np.log(2) * apart**2 / fwhm**2)  # a Gaussian kernel of that width
         blurred = (weights * noise[near]).sum(1) / weights.sum(1)
-        assert smoothness_on_mesh(points, cells, blurred[None], Kind()) == pytest.approx(fwhm, rel=0.1)
-    assert np.isnan(smoothness_on_mesh(points, cells, np.full((1, len(points)), 4.2), Kind()))
-    assert np.isnan(smoothness_on_mesh(points, cells[:20], noise[None], Kind()))
+        assert smoothness_on_mesh(points, edges_of(cells), blurred[None], Kind()) == pytest.approx(fwhm, rel=0.1)
+    assert np.isnan(smoothness_on_mesh(points, edges_of(cells), np.full((1, len(points)), 4.2), Kind()))
+    assert np.isnan(smoothness_on_mesh(points, edges_of(cells[:20]), noise[None], Kind()))
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 5.0, 20.0, 100.0])

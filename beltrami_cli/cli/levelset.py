@@ -80,8 +80,8 @@ def levelset(
         overwrite=bool(overwrite),
         notify=lambda line: note(quiet, f"warning: {line}"),
     )
-    grid, voxels = record["Grid"], record["Voxels"]
-    inside = voxels["inside"] / sum(voxels.values())
+    grid = Grid(tuple(record["Grid"]["shape"]), np.array(record["Grid"]["affine_ras_mm"]))
+    inside = record["Voxels"]["inside"] / sum(record["Voxels"].values())
     say(quiet, f"wrote {', '.join(record['Outputs'])}")
-    say(quiet, f"{Grid(tuple(grid['shape']), np.array(grid['affine_ras_mm'])).describe()}: {inside:.1%} of the voxels inside")
+    say(quiet, f"{grid.describe()}: {inside:.1%} of the voxels inside")
     return 0
