@@ -113,22 +113,22 @@ def _facing_outwards(vertices: np.ndarray, cells: np.ndarray) -> np.ndarray:
     volume = np.bincount(piece, _volumes(vertices, cells))
     if (volume >= 0).all():
         return cells
-    cells, size = cells.copy(), np.bincount(piece)
-    points, left = vertices[cells[:, 0]], np.ones(len(size), bool)
+    parts = np.split(np.argsort(piece, kind="stable"), np.cumsum(np.bincount(piece))[:-1])
+    low, high = (np.array([end(vertices[cells[part, 0]], 0) for part in parts]) for end in (np.min, np.max))
+    cells, left = cells.copy(), np.ones(len(parts), bool)
     for outer in np.argsort(-np.abs(volume)):
         if not left[outer]:
             continue
-        own = piece == outer
-        low, high = points[own].min(0), points[own].max(0)
-        near = np.flatnonzero(left[piece] & ~own & np.all((points > low) & (points < high), 1))
-        if len(near):
-            around = np.abs(igl.fast_winding_number(vertices, cells[own], points[near])) > 0.5
-            near = near[around]
-        within = np.bincount(piece[near], minlength=len(size)) == size
-        within[outer] = True
-        left &= ~within
+        left[outer] = False
+        inner = np.flatnonzero(left & np.all((low > low[outer]) & (high < high[outer]), axis=1))
+        if len(inner):
+            points = np.concatenate([vertices[cells[parts[k], 0]] for k in inner])
+            around = np.abs(igl.fast_winding_number(vertices, cells[parts[outer]], points)) > 0.5
+            inner = np.setdiff1d(inner, np.repeat(inner, [len(parts[k]) for k in inner])[~around])
+            left[inner] = False
         if volume[outer] < 0:
-            cells[within[piece]] = cells[within[piece], ::-1]
+            turned = np.concatenate([parts[k] for k in (outer, *inner)])
+            cells[turned] = cells[turned, ::-1]
     return cells
 
 
