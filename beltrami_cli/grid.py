@@ -109,6 +109,14 @@ class Grid:
         ends = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
         return self.to_world(ends * (np.array(self.shape) - 1))
 
+    def as_record(self) -> dict[str, Any]:
+        """JSON-ready, for the records beside outputs."""
+        return {
+            "shape": list(self.shape),
+            "spacing_mm": self.spacing.tolist(),
+            "affine_ras_mm": self.affine.tolist(),
+        }
+
     def describe(self) -> str:
         """One line: shape, spacing, orientation matrix and origin, for messages."""
         steps = " x ".join(f"{s:.4g}" for s in self.spacing)

@@ -58,7 +58,7 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
     beta = schedule.beta[: evolution.iterations]
     return {
         "Parameters": _used(settings, band, plan, evolution),
-        "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
+        "Grid": grid.as_record(),
         "Band": {
             "voxels": len(primary),
             "entries": band.entries,

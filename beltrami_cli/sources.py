@@ -178,7 +178,7 @@ def _described(found: LevelSet) -> dict[str, Any]:
     psi, grid = found.volume.data, found.volume.grid
     return {
         "Surface": found.surface,
-        "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
+        "Grid": grid.as_record(),
         "Voxels": {
             "inside": int((psi < 0).sum()),
             "outside": int((psi >= 0).sum()),

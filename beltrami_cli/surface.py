@@ -31,12 +31,14 @@ class Mesh:
     cells: (C, 3) int32 triangles, counter-clockwise seen from outside; (C, 2) segments for a curve.
     values: (V,) data values, or (V, K) of K channels or frames, real, NaN where missing; None for geometry alone.
     structure: the part of the brain in GIFTI's names, as CortexLeft; None where unknown.
+    placed: False where the vertices are as a file had them that does not say in which space.
     """
 
     vertices_ras_mm: np.ndarray
     cells: np.ndarray
     values: np.ndarray | None = None
     structure: str | None = None
+    placed: bool = True
 
     def __post_init__(self) -> None:
         """Raises RefusedError for arrays of other shapes, and for cells that name vertices which are not there."""

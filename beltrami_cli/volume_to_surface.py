@@ -130,6 +130,6 @@ def _record(
     sources = [(path, sha256(path), role) for path, role in job.sources.items()]
     return {
         **provenance(sources, files, parameters, warnings.lines),
-        "Grid": {"shape": list(grid.shape), "spacing_mm": grid.spacing.tolist(), "affine_ras_mm": grid.affine.tolist()},
+        "Grid": grid.as_record(),
         "Vertices": counts,
     }

@@ -303,6 +303,14 @@ def test_a_config_of_surfaces(folder):
     assert nib.load("c.surf.gii").meta["AnatomicalStructurePrimary"] == "CortexRight"
 
 
+def test_a_space_that_is_not_told_is_not_claimed(folder):
+    for surface, space in (("lh.plain", 0), ("lh.white", 1)):
+        done("denoise", surface, "lh.map", "-o", f"{surface}.func.gii", *L2)
+        written = nib.load(f"{surface}.surf.gii").darrays[0]
+        assert written.coordsys.dataspace == space
+    assert np.allclose(nib.load("lh.plain.surf.gii").darrays[0].data, MESH.vertices_ras_mm - C_RAS, atol=1e-4)
+
+
 def test_hemispheres_are_not_mixed(folder):
     write_overlay(folder / "right.func.gii", NOISY, structure="CortexRight")
     message = refused("denoise", "lh.surf.gii", "right.func.gii", "-o", "o.func.gii", *L2)

@@ -55,7 +55,7 @@ def in_scanner_ras(path: Path, stored: StoredSurface, frame: str | None, like: G
         if np.linalg.det(matrix[:3, :3]) < 0:
             # A mirror image (the frame of a right-handed volume): the outside would be the clockwise side.
             cells = np.ascontiguousarray(cells[:, ::-1])
-    return Mesh(vertices, cells, structure=stored.structure)
+    return Mesh(vertices, cells, structure=stored.structure, placed=bool(frame or stored.frame or stored.unsaid))
 
 
 def tkr_to_scanner(shape: np.ndarray, spacing: np.ndarray, directions: np.ndarray, centre: np.ndarray) -> np.ndarray:

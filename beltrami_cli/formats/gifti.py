@@ -96,10 +96,11 @@ def read_structure(path: Path) -> str | None:
 
 
 def write(path: Path, mesh: Mesh) -> None:
-    """Write vertices as float32 in scanner RAS and triangles as int32, and the values, if any, in `values_file`."""
+    """Write vertices as float32, in scanner RAS where known, and triangles; the values, if any, in `values_file`."""
     from nibabel import gifti
 
-    space = gifti.GiftiCoordSystem(dataspace=_SCANNER, xformspace=_SCANNER, xform=np.eye(4))
+    code = _SCANNER if mesh.placed else _UNKNOWN
+    space = gifti.GiftiCoordSystem(dataspace=code, xformspace=code, xform=np.eye(4))
     meta = {"GeometricType": "Anatomical"} | _structure_meta(mesh.structure)
     vertices = _array(mesh.vertices_ras_mm, "NIFTI_INTENT_POINTSET", np.float32, meta, coordsys=space)
     triangles = _array(mesh.cells, "NIFTI_INTENT_TRIANGLE", np.int32, {})
