@@ -225,6 +225,10 @@ def mesh_of(
     """
     psi = formats.read_volume(levelset, spacing=_spacing_for(levelset, spacing))
     require_usable(psi.grid, str(levelset))
+    if is_segmentation(psi.data) and two_values(psi.data) is None:
+        raise RefusedError(
+            f"{levelset}: holds labels, no level set; expected one, or a mask: make it with beltrami levelset --labels"
+        )
     axes = Canonical(psi.grid)
     band = band_of(psi.data, Settings(inside=inside), axes, Warnings(None))
     if data is None:

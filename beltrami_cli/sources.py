@@ -225,8 +225,9 @@ def surface_of(volume: Volume) -> Mesh:
     return Mesh(grid.to_world(ijk), facing(surface.cells, grid))
 
 
-def is_segmentation(finite: np.ndarray) -> bool:
-    """True where values (N,) are a mask or labels and no level set, see `read_source`; a constant is neither."""
+def is_segmentation(data: np.ndarray) -> bool:
+    """True where data, NaN aside, are a mask or labels and no level set, see `read_source`; a constant is neither."""
+    finite = data[np.isfinite(data)]
     if values := two_values(finite):
         return bool(values[1] >= 0)
     return bool(finite.size and finite.min() >= 0 and np.ptp(finite) > 0 and np.all(finite == np.rint(finite)))

@@ -373,3 +373,9 @@ def test_surfaces_of_another_unit_are_told(folder):
     assert "metres" in message
     run = beltrami("denoise", "lh.surf.gii", "lh.map", "-o", "o.func.gii", "--spacing", "5", *L2)
     assert run.code == 0 and "spacing: voxels of 5 mm" in run.err
+
+
+def test_the_mesh_of_labels(folder):
+    nifti(folder / "seg.nii.gz", (np.indices(SHAPE)[0] // 8).astype(np.uint8))
+    assert "beltrami levelset --labels" in refused("mesh", "seg.nii.gz", "-o", "m.ply")
+    done("mesh", nifti(folder / "mask.nii.gz", (ball(SHAPE, 6.0) < 0).astype(np.uint8)), "-o", "m.ply")
