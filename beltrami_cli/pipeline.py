@@ -181,7 +181,8 @@ def _denoise_vertices(
     solved = work(data, observer)
     with phases("write"):
         structure = scene.structure_of(scene.surface)
-        formats.write_overlay(stage.path(job.volume), solved.data, structure=structure, dtype=dtype)
+        names = formats.map_names(job.data, channels=several, map=_map(job.map))
+        formats.write_overlay(stage.path(job.volume), solved.data, structure=structure, dtype=dtype, names=names)
         if job.filled is not None:
             formats.write_overlay(stage.path(job.filled), solved.filled.astype(np.float32), structure=structure)
     return solved

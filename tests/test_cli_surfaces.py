@@ -379,3 +379,13 @@ def test_the_mesh_of_labels(folder):
     nifti(folder / "seg.nii.gz", (np.indices(SHAPE)[0] // 8).astype(np.uint8))
     assert "beltrami levelset --labels" in refused("mesh", "seg.nii.gz", "-o", "m.ply")
     done("mesh", nifti(folder / "mask.nii.gz", (ball(SHAPE, 6.0) < 0).astype(np.uint8)), "-o", "m.ply")
+
+
+def test_maps_keep_their_names(folder):
+    write_overlay(folder / "lh.two.func.gii", np.stack([NOISY, NOISY], -1), names=["angle", "ecc"])
+    done("denoise", "lh.surf.gii", "lh.two.func.gii", "-o", "o.func.gii", "--kind", "vector", *L2)
+    done("denoise", "lh.surf.gii", "lh.two.func.gii", "-o", "e.func.gii", "--map", "ecc", *L2)
+    for name, names in (("o", ["angle", "ecc"]), ("e", ["ecc"])):
+        arrays = nib.load(f"{name}.func.gii").darrays
+        assert [array.meta["Name"] for array in arrays] == names
+        assert {array.intent for array in arrays} == {nib.nifti1.intent_codes["NIFTI_INTENT_NONE"]}

@@ -17,6 +17,7 @@ from beltrami_cli.formats import checks, freesurfer, gifti, metaimage, mgh, nift
 from beltrami_cli.formats.checks import require_file, writing
 from beltrami_cli.formats.overlays import (
     is_overlay,
+    map_names,
     overlay_files,
     overlay_format,
     overlay_structure,
@@ -40,6 +41,7 @@ __all__ = [
     "is_npy",
     "is_overlay",
     "is_surface",
+    "map_names",
     "mesh_beside",
     "mesh_files",
     "mesh_format",

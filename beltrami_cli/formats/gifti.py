@@ -109,15 +109,15 @@ def write(path: Path, mesh: Mesh) -> None:
         write_maps(values_file(path), mesh.named_values(), mesh.structure)
 
 
-def write_maps(path: Path, maps: Mapping[str, np.ndarray], structure: str | None) -> None:
-    """Write maps by name as float32: SHAPE in .shape.gii, else NONE for one map and TIME_SERIES for several.
+def write_maps(path: Path, maps: Mapping[str, np.ndarray], structure: str | None, *, series: bool = True) -> None:
+    """Write maps by name as float32: SHAPE in .shape.gii, else NONE, or TIME_SERIES for the several of a `series`.
 
     TIME_SERIES is what makes nibabel and FreeSurfer read several maps as the one array (V, K) that they are here.
     """
     if path.name.lower().endswith(".shape.gii"):
         intent = "NIFTI_INTENT_SHAPE"
     else:
-        intent = "NIFTI_INTENT_NONE" if len(maps) == 1 else "NIFTI_INTENT_TIME_SERIES"
+        intent = "NIFTI_INTENT_TIME_SERIES" if series and len(maps) > 1 else "NIFTI_INTENT_NONE"
     arrays = [_array(values, intent, np.float32, {"Name": name}) for name, values in maps.items()]
     _save(path, arrays, structure)
 

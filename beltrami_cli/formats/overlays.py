@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -111,6 +112,15 @@ def read_maps(path: Path, vertices: int | None = None) -> dict[str, np.ndarray]:
             return _read_voxels(path, kind, vertices)
 
 
+def map_names(path: Path, *, channels: bool = False, map: str | int | None = None) -> list[str] | None:
+    """The names of the maps that `read_overlay` takes, None where the file has none for them; raises as it does."""
+    path = Path(path)
+    if overlay_format(path) != "GIFTI":
+        return None
+    taken = _chosen(path, read_maps(path), channels, map)
+    return None if any(re.fullmatch(r"(map|frame|value)( \d+)?", name) for name in taken) else taken
+
+
 def read_overlay(
     path: Path, vertices: int, *, dtype: DTypeLike = np.float32, channels: bool = False, map: str | int | None = None
 ) -> np.ndarray:
@@ -131,10 +141,16 @@ def read_overlay(
 
 
 def write_overlay(
-    path: Path, values: np.ndarray, *, structure: str | None = None, dtype: DTypeLike = np.float32
+    path: Path,
+    values: np.ndarray,
+    *,
+    structure: str | None = None,
+    dtype: DTypeLike = np.float32,
+    names: Sequence[str] | None = None,
 ) -> None:
-    """Write values (V,), or (V, K) as K maps or frames, named as those of a mesh.
+    """Write values (V,), or (V, K) as K maps or frames.
 
+    names: of the maps, for GIFTI; by default those of a mesh's values, several of which are the frames of a series.
     structure: for GIFTI, as `Mesh.structure`. dtype: uint8 for a mask in MGH; else everything is stored as float32.
     NaN is kept in every format. Raises RefusedError as `require_overlay_writable`, DataError where writing fails.
     """
@@ -143,7 +159,10 @@ def write_overlay(
     match overlay_format(path):
         case "GIFTI":
             no_geometry = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32), values)
-            gifti.write_maps(path, no_geometry.named_values(), structure)
+            maps = no_geometry.named_values()
+            if names is not None:
+                maps = dict(zip(names, maps.values(), strict=True))
+            gifti.write_maps(path, maps, structure, series=names is None)
         case "MGH":
             _write_mgh(path, values, np.uint8 if np.dtype(dtype) == np.uint8 else np.float32)
         case _:
