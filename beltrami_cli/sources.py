@@ -16,7 +16,7 @@ from beltrami_cli.distance import HALF_WIDTH, MARGIN, own_grid, signed_distance
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.grid import Canonical, Grid, Volume
 from beltrami_cli.inputs import Warnings, require_usable
-from beltrami_cli.levelset import crossing_box, facing, two_values, zero_surface
+from beltrami_cli.levelset import crossing_box, facing, sampled, two_values, zero_surface
 from beltrami_cli.record import provenance, sha256, sidecar_of, write_record
 from beltrami_cli.repair import repaired
 from beltrami_cli.segmentation import Labels, surface_of_labels
@@ -70,8 +70,7 @@ def read_source(
     if frame is not None:
         raise RefusedError(f"{path}: --frame is for surface files; found a volume, whose header says where it is")
     volume = formats.read_volume(path, spacing=spacing, dtype=dtype)
-    finite = volume.data[np.isfinite(volume.data)]
-    if not (wanted or sides or is_segmentation(finite)):
+    if not (wanted or sides or is_segmentation(volume.data)):
         return volume
     if notify:
         for line in volume.notes:
@@ -227,9 +226,12 @@ def surface_of(volume: Volume) -> Mesh:
 
 def is_segmentation(data: np.ndarray) -> bool:
     """True where data, NaN aside, are a mask or labels and no level set, see `read_source`; a constant is neither."""
-    finite = data[np.isfinite(data)]
-    if values := two_values(finite):
+    if values := two_values(data):
         return bool(values[1] >= 0)
+    some = sampled(data)
+    if (some < 0).any() or (some != np.rint(some)).any():
+        return False
+    finite = data[np.isfinite(data)]
     return bool(finite.size and finite.min() >= 0 and np.ptp(finite) > 0 and np.all(finite == np.rint(finite)))
 
 
