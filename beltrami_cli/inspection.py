@@ -14,7 +14,7 @@ from beltrami_cli.inputs import Warnings, band_of, require_usable
 from beltrami_cli.levelset import crossing_box, two_values
 from beltrami_cli.metrics import Difference, difference
 from beltrami_cli.sources import is_segmentation
-from beltrami_cli.surface import Mesh
+from beltrami_cli.surface import Mesh, edge_counts
 
 REMEDY = "bring them onto one grid first, for example with denoise --resample"
 
@@ -87,7 +87,7 @@ def describe_surface(path: Path) -> list[str]:
     """Lines on format, size, place, border and structure of a surface; raises as `formats.read_surface`."""
     mesh = formats.read_surface(path)
     points, cells = mesh.vertices_ras_mm, mesh.cells
-    edges, triangles = _edges(cells)
+    edges, triangles = edge_counts(cells)
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     border, shared = int((triangles == 1).sum()), int((triangles > 2).sum())
     lines = [
@@ -108,13 +108,6 @@ def describe_surface(path: Path) -> list[str]:
 
 def _count(number: int, one: str, several: str = "") -> str:
     return f"{number} {one if number == 1 else several or one + 's'}"
-
-
-def _edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The edges (N, 2) of triangles, and how many triangles (N,) have each."""
-    ends = np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
-    key, triangles = np.unique(ends[:, 0] << 32 | ends[:, 1], return_counts=True)
-    return np.stack([key >> 32, key & 0xFFFFFFFF], 1), triangles
 
 
 def _frame(path: Path, mesh: Mesh) -> str:

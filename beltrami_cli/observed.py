@@ -100,9 +100,7 @@ class AtVoxels:
     noun = "voxels"
 
     def start(self) -> Extended:
-        return extend(
-            self.band, self.values, self.trust, self.extension, depth=self.depth, turns=self.kind.turns
-        )  # fmt: skip
+        return extend(self.band, self.values, self.trust, self.extension, depth=self.depth, turns=self.kind.turns)
 
     def without(self, held: np.ndarray) -> AtVoxels:
         values, trust = _emptied(self, held)

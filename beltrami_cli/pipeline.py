@@ -134,9 +134,11 @@ def _denoise_vertices(
     assert scene.surface is not None
     count, dtype, several = len(scene.surface.vertices_ras_mm), job.settings.precision, job.settings.kind == "vector"
     with phases("read"):
-        data = formats.read_overlay(job.data, count, dtype=dtype, channels=several, map=_map(job.map))
+        data, names = formats.read_named_overlay(job.data, count, dtype=dtype, channels=several, map=_map(job.map))
         if several and data.ndim == 1:
             data = data[:, None]
+        for path in (job.volume, *(file for _, file in job.on)):
+            formats.require_overlay_writable(path, data.shape[1] if several else 1)
         weights, mask = (
             None if path is None else formats.read_overlay(path, count, dtype=dtype) for path in (job.weights, job.mask)
         )
@@ -147,7 +149,6 @@ def _denoise_vertices(
     solved = work(data, observer)
     with phases("write"):
         structure = scene.structure_of(scene.surface)
-        names = formats.map_names(job.data, channels=several, map=_map(job.map))
         formats.write_overlay(stage.path(job.volume), solved.data, structure=structure, dtype=dtype, names=names)
         if job.filled is not None:
             formats.write_overlay(stage.path(job.filled), solved.filled.astype(np.float32), structure=structure)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beltrami_cli.errors import DataError
-from beltrami_cli.surface import Mesh
+from beltrami_cli.surface import Mesh, volumes
 
 # A hole is a defect, and closed, where the fan over its rim has at most this share of the area of the piece that it is
 # in. The medial wall cut out of a hemisphere has 5 % or more; the fan over the border of a patch, about its area.
@@ -52,7 +52,7 @@ def repaired(mesh: Mesh, *, as_faced: bool = False) -> Repaired:
     inside_out = False
     if not len(border) and not as_faced:
         cells = _facing_outwards(vertices, cells)
-    elif not len(border) and _volumes(vertices, cells).sum() < 0:
+    elif not len(border) and volumes(vertices, cells).sum() < 0:
         cells, inside_out = cells[:, ::-1], True
     # Only now: triangles without area tell what is connected to what.
     cells = cells[areas(vertices, cells) > 0]
@@ -110,7 +110,7 @@ def _facing_outwards(vertices: np.ndarray, cells: np.ndarray) -> np.ndarray:
     import igl
 
     piece = igl.facet_components(cells)[1]
-    volume = np.bincount(piece, _volumes(vertices, cells))
+    volume = np.bincount(piece, volumes(vertices, cells))
     if (volume >= 0).all():
         return cells
     parts = np.split(np.argsort(piece, kind="stable"), np.cumsum(np.bincount(piece))[:-1])
@@ -211,9 +211,3 @@ def _pieces(count: int, cells: np.ndarray) -> np.ndarray:
     ends = edges(cells).reshape(-1, 2).T
     graph = coo_array((np.ones(ends.shape[1], np.int8), (ends[0], ends[1])), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1])
-
-
-def _volumes(vertices: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """(C,) mm^3 below each triangle: the sum is what a closed surface holds, negative where it faces inwards."""
-    a, b, c = (vertices[cells[:, k]] - vertices.mean(0) for k in range(3))
-    return np.asarray((np.cross(a, b) * c).sum(1) / 6)

@@ -9,18 +9,29 @@ import numpy as np
 from beltrami_cli.errors import DataError, RefusedError
 
 
-def edges_of(cells: np.ndarray) -> np.ndarray:
-    """(N, 2) edges of triangles (C, 3), each once, its smaller vertex first, in order."""
+def edge_counts(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 2) edges of triangles (C, 3), each once, its smaller vertex first, in order; how many triangles have each."""
     ends = np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1).astype(np.int64)
     count = int(ends.max(initial=0)) + 1
-    return np.stack(np.divmod(np.unique(ends[:, 0] * count + ends[:, 1]), count), 1)
+    codes, triangles = np.unique(ends[:, 0] * count + ends[:, 1], return_counts=True)
+    return np.stack(np.divmod(codes, count), 1), triangles
+
+
+def edges_of(cells: np.ndarray) -> np.ndarray:
+    """(N, 2) edges of triangles (C, 3), as `edge_counts` has them."""
+    return edge_counts(cells)[0]
+
+
+def volumes(vertices: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """(C,) mm^3 below each triangle: the sum is what a closed surface holds, negative where it faces inwards."""
+    a, b, c = (vertices[cells[:, k]] - vertices.mean(0) for k in range(3))
+    return np.asarray((np.cross(a, b) * c).sum(1) / 6)
 
 
 def faces_inwards(mesh: Mesh) -> bool:
     """True for a closed surface of triangles whose corners run clockwise seen from outside."""
-    a, b, c = (mesh.vertices_ras_mm[mesh.cells[:, k]] - mesh.vertices_ras_mm.mean(0) for k in range(3))
     is_closed = 2 * len(edges_of(mesh.cells)) == 3 * len(mesh.cells)
-    return is_closed and float((a * np.cross(b, c)).sum()) < 0
+    return is_closed and float(volumes(mesh.vertices_ras_mm, mesh.cells).sum()) < 0
 
 
 @dataclass(frozen=True, eq=False)

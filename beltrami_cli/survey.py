@@ -86,7 +86,6 @@ def survey(job: Job) -> Scene:
         job.settings.half_width(grid.used_spacing)
     like = None if at_vertices else grid
     on = tuple(formats.read_surface(path, frame=job.frame, like=like, frame_where_unsaid=True) for path, _ in job.on)
-    _require_room(job, at_vertices)
     header = None
     if job.resample and surface is None and job.levelset is not None:
         header = formats.open_series(job.levelset, spacing=spacing_for(job.levelset, job.spacing)).header
@@ -152,17 +151,6 @@ def _require_one_hemisphere(job: Job, structure: str | None) -> None:
             )
 
 
-def _require_room(job: Job, at_vertices: bool) -> None:
-    """Raise RefusedError where files of values at vertices cannot hold as many channels as DATA has."""
-    channels = 1
-    if job.settings.kind == "vector":
-        channels = len(formats.read_maps(job.data)) if at_vertices else formats.read_layout(job.data)[0]
-    for path in ([job.volume] if at_vertices else []) + [file for _, file in job.on]:
-        formats.require_overlay_writable(path, channels)
-    if at_vertices and job.filled is not None:
-        formats.require_overlay_writable(job.filled, 1)
-
-
 def _check_grids(job: Job, surface: Mesh | None) -> Grid:
     """The grid to compute on, from headers alone; raises RefusedError where it or the outputs' formats will not do."""
     if job.spacing is not None and not any(formats.is_npy(path) for path in job.all_inputs):
@@ -185,6 +173,8 @@ def _check_grids(job: Job, surface: Mesh | None) -> Grid:
     require_usable(grid, str(where))
     layout = formats.read_layout(job.data, plane=is_plane(job, grid)) if several else (1, False)
     formats.require_writable(job.volume, grid, channels=layout[0], is_complex=layout[1])
+    for _, file in job.on:
+        formats.require_overlay_writable(file, layout[0])
     if job.filled is not None:
         formats.require_writable(job.filled, grid)
     return grid

@@ -67,3 +67,11 @@ def announce_compilation(quiet: bool) -> None:
 
 def overwrite_option(command: Any) -> Any:
     return click.option("--overwrite", is_flag=True, default=None, help="Replace outputs that exist.")(command)
+
+
+def frame_option(command: Any) -> Any:
+    return click.option(
+        "--frame",
+        type=click.Choice(["scanner", "tkr"]),
+        help="The coordinates of surfaces: scanner RAS, or FreeSurfer's surface RAS. Default: what the file says.",
+    )(command)

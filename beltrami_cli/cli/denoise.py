@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from beltrami_cli.cli.common import Command, announce_compilation, note, overwrite_option, say
+from beltrami_cli.cli.common import Command, announce_compilation, frame_option, note, overwrite_option, say
 
 FILE = click.Path(path_type=Path)
 
@@ -69,11 +69,7 @@ class Denoise(Command):
 @click.option("--labels", metavar="L1,L2..", help="LEVELSET is a segmentation: these labels are inside.")
 @click.option("--between", metavar="INNER,OUTER", help="The same, and the surface runs midway between the two labels.")
 @click.option("--map", metavar="NAME|N", help="Which map of DATA at vertices, where the file has several.")
-@click.option(
-    "--frame",
-    type=click.Choice(["scanner", "tkr"]),
-    help="What the coordinates of surfaces are: scanner RAS, or FreeSurfer's surface RAS. Default: what the file says.",
-)
+@frame_option
 @click.option(
     "--structure",
     metavar="NAME",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from beltrami_cli.cli.common import Command, announce_compilation, note, overwrite_option, say
+from beltrami_cli.cli.common import Command, announce_compilation, frame_option, note, overwrite_option, say
 
 FILE = click.Path(path_type=Path)
 
@@ -28,11 +28,7 @@ FILE = click.Path(path_type=Path)
     "opposite banks); S or SX,SY,SZ: of .npy files (default: 1).",
 )
 @click.option("--margin", type=float, metavar="MM", help="Of the grid around a surface, beyond it. Default: 7 voxels.")
-@click.option(
-    "--frame",
-    type=click.Choice(["scanner", "tkr"]),
-    help="The coordinates of a surface: scanner RAS, or FreeSurfer's surface RAS. Default: what its file says.",
-)
+@frame_option
 @overwrite_option
 def levelset(
     source: Path,

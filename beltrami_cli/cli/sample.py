@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from beltrami_cli.cli.common import Command, note, overwrite_option, say
+from beltrami_cli.cli.common import Command, frame_option, note, overwrite_option, say
 
 FILE = click.Path(path_type=Path)
 
@@ -26,11 +26,7 @@ FILE = click.Path(path_type=Path)
 )
 @click.option("--period", metavar="P", help="Of circular data, in their unit: 360, 2pi, 24 ...")
 @click.option("--missing", type=float, metavar="VALUE", help="A value of VOLUME that means none, as NaN always does.")
-@click.option(
-    "--frame",
-    type=click.Choice(["scanner", "tkr"]),
-    help="The coordinates of SURFACE: scanner RAS, or FreeSurfer's surface RAS. Default: what its file says.",
-)
+@frame_option
 @click.option("--structure", metavar="NAME", help="CortexLeft, CortexRight ... Default: what SURFACE or its name says.")
 @click.option("--spacing", metavar="S|SX,SY,SZ", help="Voxel size in mm of an .npy VOLUME. Default: 1.")
 @overwrite_option

@@ -17,11 +17,11 @@ from beltrami_cli.formats import checks, freesurfer, gifti, metaimage, mgh, nift
 from beltrami_cli.formats.checks import require_file, writing
 from beltrami_cli.formats.overlays import (
     is_overlay,
-    map_names,
     overlay_files,
     overlay_format,
     overlay_structure,
     read_maps,
+    read_named_overlay,
     read_overlay,
     require_overlay_writable,
     write_overlay,
@@ -41,7 +41,6 @@ __all__ = [
     "is_npy",
     "is_overlay",
     "is_surface",
-    "map_names",
     "mesh_beside",
     "mesh_files",
     "mesh_format",
@@ -53,6 +52,7 @@ __all__ = [
     "read_grid",
     "read_layout",
     "read_maps",
+    "read_named_overlay",
     "read_overlay",
     "read_surface",
     "read_volume",

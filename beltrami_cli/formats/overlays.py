@@ -18,6 +18,7 @@ from beltrami_cli.formats.structures import structure_of_name
 from beltrami_cli.surface import Mesh
 
 _GIFTI_METRICS = (".func.gii", ".shape.gii")
+_NUMBERED = re.compile(r"(map|frame|value)( \d+)?")  # what maps are called that nobody named
 _SUFFIXES = {".gii": "GIFTI", ".mgz": "MGH", ".mgh": "MGH", ".nii": "NIfTI", ".nii.gz": "NIfTI"}
 
 
@@ -112,15 +113,6 @@ def read_maps(path: Path, vertices: int | None = None) -> dict[str, np.ndarray]:
             return _read_voxels(path, kind, vertices)
 
 
-def map_names(path: Path, *, channels: bool = False, map: str | int | None = None) -> list[str] | None:
-    """The names of the maps that `read_overlay` takes, None where the file has none for them; raises as it does."""
-    path = Path(path)
-    if overlay_format(path) != "GIFTI":
-        return None
-    taken = _chosen(path, read_maps(path), channels, map)
-    return None if any(re.fullmatch(r"(map|frame|value)( \d+)?", name) for name in taken) else taken
-
-
 def read_overlay(
     path: Path, vertices: int, *, dtype: DTypeLike = np.float32, channels: bool = False, map: str | int | None = None
 ) -> np.ndarray:
@@ -131,13 +123,21 @@ def read_overlay(
     Raises RefusedError where the file is no vertex data, has several maps and neither is given, has no such map, or
     another number of values than the surface has vertices; DataError where it cannot be read.
     """
+    return read_named_overlay(path, vertices, dtype=dtype, channels=channels, map=map)[0]
+
+
+def read_named_overlay(
+    path: Path, vertices: int, *, dtype: DTypeLike = np.float32, channels: bool = False, map: str | int | None = None
+) -> tuple[np.ndarray, list[str] | None]:
+    """As `read_overlay`, with the names that the maps have in GIFTI, None where they have none of their own."""
     path = Path(path)
     maps = read_maps(path, vertices)
     chosen = _chosen(path, maps, channels, map)
     for name in chosen:
         _require_fit(path, maps[name], vertices)
     columns = [maps[name].astype(dtype) for name in chosen]
-    return columns[0] if len(columns) == 1 else np.stack(columns, -1)
+    unnamed = overlay_format(path) != "GIFTI" or any(_NUMBERED.fullmatch(name) for name in chosen)
+    return columns[0] if len(columns) == 1 else np.stack(columns, -1), None if unnamed else chosen
 
 
 def write_overlay(
