@@ -19,3 +19,7 @@ class RefusedError(BeltramiError):
     """Refused before starting: usage, configuration, an output that exists, grids that differ, dt over its bound."""
 
     exit_code = 2
+
+
+class BusyError(RefusedError):
+    """Refused because another run is writing the same outputs at this moment: it can be tried again later."""

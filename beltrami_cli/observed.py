@@ -73,8 +73,8 @@ class Observed(Protocol):
     def can_hold_out(self) -> tuple[np.ndarray, int]:
         """Places (n,) whose data may be held out, and how many of them to hold out."""
 
-    def noise_sd(self) -> np.ndarray:
-        """As `noise.noise_sd`."""
+    def noise_sd(self, u: np.ndarray | None = None) -> np.ndarray:
+        """As `noise.noise_sd`, of the data, or, where there are data, of the band's values u (K, E) in their place."""
 
     def smoothness_mm(self, u: np.ndarray | None = None) -> float:
         """As `noise.smoothness_mm`, of the data, or of the band's values u (K, E) in their place."""
@@ -131,8 +131,9 @@ class AtVoxels:
         share = SHELL_SHARE if valid is shell and self.depth is None else NEAR_SHARE
         return valid, round(share * len(valid))
 
-    def noise_sd(self) -> np.ndarray:
-        return noise_sd(self.band, self.values, self.kind)
+    def noise_sd(self, u: np.ndarray | None = None) -> np.ndarray:
+        values = self.values if u is None else np.where(np.isnan(self.values), np.nan, u)
+        return noise_sd(self.band, values, self.kind)
 
     def smoothness_mm(self, u: np.ndarray | None = None) -> float:
         return smoothness_mm(self.band, self.values if u is None else u, self.kind)
@@ -236,8 +237,11 @@ class AtVertices:
         valid = self.near()
         return valid, round(VERTEX_SHARE * len(valid))
 
-    def noise_sd(self) -> np.ndarray:
-        return noise_sd_on_mesh(self.on.cells, self.values, self.kind)
+    def noise_sd(self, u: np.ndarray | None = None) -> np.ndarray:
+        values = self.values
+        if u is not None:
+            values = np.where(np.isnan(values), np.nan, self.on.vertices(u, turns=self.kind.turns))
+        return noise_sd_on_mesh(self.on.cells, values, self.kind)
 
     def smoothness_mm(self, u: np.ndarray | None = None) -> float:
         values = self.values if u is None else self.on.vertices(u, turns=self.kind.turns)

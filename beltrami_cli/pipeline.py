@@ -20,7 +20,7 @@ from beltrami_cli.inputs import Warnings, band_of, require_usable, without
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.levelset import two_values
 from beltrami_cli.progress import Phases
-from beltrami_cli.record import sha256, sidecar, write_record
+from beltrami_cli.record import sha256, sidecar, sources_of, write_record
 from beltrami_cli.resample import resample
 from beltrami_cli.sampling import surface_mesh
 from beltrami_cli.solver import Gathered, Result, Solver
@@ -40,12 +40,14 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
     with phases("read"):
         scene = survey(job)
     files = Files(job, scene)
-    sources = [file for path in job.all_inputs for file in formats.input_files(path)]
-    with formats.Stage(files.all, overwrite=job.overwrite, inputs=sources) as stage:
+    sources = sources_of(job)
+    inputs = [path for path, _ in sources]
+    with formats.Stage(files.all, overwrite=job.overwrite, inputs=inputs) as stage:
+        phases.tell = stage.tell
         with phases("numba"):
             kernels.wake()
         with ThreadPoolExecutor(1) as pool:
-            digests = pool.submit(lambda: [sha256(path) for path in sources])
+            digests = pool.submit(lambda: [sha256(path) for path in inputs])
             if scene.at_vertices:
                 work = _denoise_vertices
             else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from beltrami_cli.evolve import Observer
@@ -29,13 +29,18 @@ def iteration_bar(label: str, *, quiet: bool = False) -> Iterator[Observer | Non
 
 
 class Phases:
-    """A stopwatch: `with phases("read"): ...` adds the block's seconds of wall time to `phases.seconds["read"]`."""
+    """A stopwatch: `with phases("read"): ...` adds the block's seconds of wall time to `phases.seconds["read"]`.
+
+    tell: called with the name of each phase that begins.
+    """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.tell: Callable[[str], None] = lambda phase: None
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
+        self.tell(name)
         start = time.perf_counter()
         try:
             yield

@@ -8,6 +8,7 @@ import math
 import os
 import sys
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -77,7 +78,9 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
         "TypicalSlope": plan.slope,
         "Noise": {
             "sd": [_number(sd) for sd in plan.noise],
-            "meaning": f"robust standard deviation over {ran.observed.noun} on the surface, data units, per channel",
+            "after": [_number(sd) for sd in ran.observed.noise_sd(ran.values)],
+            "meaning": f"robust standard deviation over {ran.observed.noun} on the surface, data units, per channel, "
+            "before (sd) and after",
         },
         "Smoothness": {
             "before_mm": _number(ran.smoothness[0]),
@@ -150,9 +153,24 @@ def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def sources_of(job: Job) -> list[tuple[Path, str | None]]:
+    """Every file that a job reads, and what it is to the run; None for the second file of a pair.
+
+    Raises RefusedError where one is missing.
+    """
+    named = [("levelset", job.levelset), ("data", job.data), ("weights", job.weights), ("mask", job.mask)]
+    named += [("on", surface) for surface, _ in job.on]
+    return [
+        (file, role if file == path else None)
+        for role, path in named
+        if path is not None
+        for file in formats.input_files(path)
+    ]
+
+
 def sidecar(
     job: Job,
-    sources: list[Path],
+    sources: list[tuple[Path, str | None]],
     files: list[Path],
     hashes: list[str],
     happened: dict[str, Any],
@@ -160,17 +178,39 @@ def sidecar(
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     """The record of a run on files."""
-    roles = [("levelset", job.levelset), ("data", job.data), ("weights", job.weights), ("mask", job.mask)]
-    roles += [("on", surface) for surface, _ in job.on]
-    role_of = {file: role for role, file in reversed(roles)}
-    read = [(path, digest, role_of.get(path)) for path, digest in zip(sources, hashes, strict=True)]
+    read = [(path, digest, role) for (path, role), digest in zip(sources, hashes, strict=True)]
     parameters = {**happened["Parameters"], **{name: getattr(job, name) for name in OF_FILES}}
     return {
         **provenance(read, files, parameters, warnings),
+        "Request": request(job),
         **{name: value for name, value in happened.items() if name != "Parameters"},
         "Seconds": {name: round(spent, 3) for name, spent in seconds.items()},
         "PeakMemoryMiB": _peak_memory_mib(),
     }
+
+
+def request(job: Job) -> dict[str, Any]:
+    """What was asked of a run, apart from the content of its inputs: with that, all that its outputs follow from.
+
+    JSON-ready; files by their place relative to the sidecar, so that a study can move. What a machine has to give,
+    threads and memory, is left out: outputs do not depend on it.
+    """
+    folder = sidecar_of(job.volume).parent
+
+    def place(path: Path | None) -> str | None:
+        return None if path is None else Path(os.path.relpath(path, folder)).as_posix()
+
+    settings = {name: value for name, value in asdict(job.settings).items() if name != "threads"}
+    asked = {
+        **settings,
+        "beta": str(job.settings.beta),
+        **{name: getattr(job, name) for name in OF_FILES},
+        "volume": place(job.volume),
+        "mesh": None if job.mesh is None else [place(path) for path in job.mesh],
+        "filled": place(job.filled),
+        "on": [place(path) for _, path in job.on],
+    }
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in asked.items()}
 
 
 def provenance(
@@ -186,10 +226,10 @@ def provenance(
     return {
         "GeneratedBy": [{"Name": "beltrami_cli", "Version": __version__}],
         "Sources": [
-            {"Path": os.fspath(path), "SHA256": digest} | ({"Role": role} if role else {})
+            {"Path": os.path.abspath(path), "SHA256": digest} | ({"Role": role} if role else {})
             for path, digest, role in sources
         ],
-        "Outputs": [os.fspath(file) for file in outputs],
+        "Outputs": [os.path.abspath(file) for file in outputs],
         "Created": datetime.now(UTC).isoformat(timespec="seconds"),
         "Parameters": dict(parameters),
         "Warnings": list(warnings),
@@ -214,8 +254,14 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def forget_peak_memory() -> None:
+    """Start `PeakMemoryMiB` anew, for a process that does one run after another; only Linux can."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
 def _peak_memory_mib() -> float | None:
-    """Largest resident set of this process so far; None where the system does not say (Windows)."""
+    """Largest resident set of this process so far, or since `forget_peak_memory`; None where the system does not say (Windows)."""
     status = Path("/proc/self/status")
     if status.exists():  # Linux, where ru_maxrss counts the peak of the process that started this one too
         for line in status.read_text().splitlines():

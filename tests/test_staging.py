@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.errors import BusyError, DataError, RefusedError
 from beltrami_cli.formats import Stage
+from beltrami_cli.formats.staging import who_writes
 
 
 def everything_in(folder: Path) -> set[str]:
@@ -54,13 +56,115 @@ def test_a_killed_run_leaves_no_output_and_the_next_one_clears_up(tmp_path):
     )
     killed = subprocess.run([sys.executable, "-c", program, str(final)], check=False)
     assert killed.returncode == -9
-    assert everything_in(tmp_path) == {".o.nii.gz.partial", ".o.nii.gz.partial/o.nii.gz"}
+    left = {f".o.nii.gz.partial/{name}" for name in ("o.nii.gz", ".lock", ".running")}
+    assert everything_in(tmp_path) == {".o.nii.gz.partial", *left}
 
     with Stage([final]) as stage:
         assert not stage.path(final).exists()
         stage.path(final).write_text("whole")
         stage.commit()
     assert everything_in(tmp_path) == {"o.nii.gz"}
+
+
+def writing_elsewhere(*finals: Path) -> subprocess.Popen[str]:
+    """A process that has entered a stage for these files, and stays in it until it is killed."""
+    program = (
+        "import sys, time; from pathlib import Path; from beltrami_cli.formats import Stage\n"
+        "with Stage([Path(p) for p in sys.argv[1:]]) as stage:\n"
+        "    stage.path(Path(sys.argv[1])).write_text('half'); stage.tell('flow')\n"
+        "    print('in', flush=True); time.sleep(60)\n"
+    )
+    other = subprocess.Popen([sys.executable, "-c", program, *map(str, finals)], stdout=subprocess.PIPE, text=True)
+    assert other.stdout is not None
+    assert other.stdout.readline() == "in\n"
+    return other
+
+
+def test_two_runs_never_write_the_same_outputs_at_once(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    volume, mesh, mark = tmp_path / "o.npy", tmp_path / "meshes" / "o.ply", tmp_path / "o.json"
+    with writing_elsewhere(volume, mesh, mark) as other:
+        assert who_writes(mark) == {"process": other.pid, "host": socket.gethostname(), "phase": "flow"}
+        before = everything_in(tmp_path)
+        for finals in ([volume, mesh, mark], [tmp_path / "o.mha", mark], [tmp_path / "p.npy", mesh]):
+            with pytest.raises(BusyError, match=rf"another run is writing it \(process {other.pid} on "), Stage(finals):
+                pass
+            Stage(finals).sweep()
+            assert everything_in(tmp_path) == before
+        other.kill()
+    with Stage([volume, mesh, mark]) as stage:
+        for final in (volume, mesh, mark):
+            stage.path(final).write_text("whole")
+        stage.commit()
+    assert everything_in(tmp_path) == {"meshes", "o.npy", "meshes/o.ply", "o.json"}
+    assert who_writes(mark) is None
+
+
+def test_one_process_cannot_enter_twice(tmp_path):
+    with Stage([tmp_path / "o"]) as first:
+        first.path(tmp_path / "o").write_text("first")
+        with pytest.raises(BusyError), Stage([tmp_path / "o"]):
+            pass
+        first.commit()
+    assert everything_in(tmp_path) == {"o"}
+
+
+def test_what_another_run_finished_meanwhile_is_not_replaced(tmp_path):
+    late = Stage([tmp_path / "o"])
+    with Stage([tmp_path / "o"]) as first:
+        first.path(tmp_path / "o").write_text("first")
+        first.commit()
+    with pytest.raises(RefusedError, match="exists already"), late:
+        pass
+    assert (tmp_path / "o").read_text() == "first"
+    assert everything_in(tmp_path) == {"o"}
+
+
+def test_what_a_killed_run_left_is_swept(tmp_path):
+    with writing_elsewhere(tmp_path / "o") as other:
+        other.kill()
+    assert ".o.partial" in everything_in(tmp_path)
+    Stage([tmp_path / "o"]).sweep()
+    assert everything_in(tmp_path) == set()
+
+
+def test_a_run_killed_between_two_names_leaves_nothing_in_the_way(tmp_path):
+    finals = [tmp_path / "o.npy", tmp_path / "o.json"]
+    program = (
+        "import os, signal, sys; from pathlib import Path; from beltrami_cli.formats import Stage\n"
+        "finals, replace = [Path(p) for p in sys.argv[1:]], os.replace\n"
+        "with Stage(finals) as stage:\n"
+        "    for final in finals: stage.path(final).write_text('killed')\n"
+        "    os.replace = lambda a, b: os.kill(os.getpid(), signal.SIGKILL) if b == finals[1] else replace(a, b)\n"
+        "    stage.commit()\n"
+    )
+    assert subprocess.run([sys.executable, "-c", program, *map(str, finals)], check=False).returncode == -9
+    assert {"o.npy", ".o.json.partial/o.json"} < everything_in(tmp_path)
+    with Stage(finals) as stage:
+        for final in finals:
+            stage.path(final).write_text("whole")
+        stage.commit()
+    assert everything_in(tmp_path) == {"o.npy", "o.json"}
+    assert [final.read_text() for final in finals] == ["whole", "whole"]
+
+
+def test_many_runs_at_once_enter_one_by_one(tmp_path):
+    program = (
+        "import sys; from pathlib import Path; from beltrami_cli.errors import BusyError\n"
+        "from beltrami_cli.formats import Stage\n"
+        "final, entered = Path(sys.argv[1]), 0\n"
+        "while entered < 50:\n"
+        "    try:\n"
+        "        with Stage([final], overwrite=True) as stage:\n"
+        "            inside = stage.path(final)\n"
+        "            assert not inside.exists()\n"
+        "            inside.write_text(sys.argv[2]); assert inside.read_text() == sys.argv[2]\n"
+        "            stage.commit(); entered += 1\n"
+        "    except BusyError: pass\n"
+    )
+    runs = [subprocess.Popen([sys.executable, "-c", program, str(tmp_path / "o"), str(k)]) for k in range(4)]
+    assert [run.wait(60) for run in runs] == [0] * 4
+    assert everything_in(tmp_path) == {"o"}
 
 
 def test_an_existing_output_needs_overwrite(tmp_path):

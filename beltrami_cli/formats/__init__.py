@@ -26,8 +26,9 @@ from beltrami_cli.formats.overlays import (
     require_overlay_writable,
     write_overlay,
 )
+from beltrami_cli.formats.plain_mesh import read_curve, read_values
 from beltrami_cli.formats.series import Series, counted
-from beltrami_cli.formats.staging import Stage
+from beltrami_cli.formats.staging import Stage, who_writes
 from beltrami_cli.formats.structures import STRUCTURES, parse_structure, structure_of_name
 from beltrami_cli.formats.surfaces import is_surface, read_surface, surface_format
 from beltrami_cli.grid import Grid, Volume
@@ -49,12 +50,14 @@ __all__ = [
     "overlay_format",
     "overlay_structure",
     "parse_structure",
+    "read_curve",
     "read_grid",
     "read_layout",
     "read_maps",
     "read_named_overlay",
     "read_overlay",
     "read_surface",
+    "read_values",
     "read_volume",
     "require_file",
     "require_overlay_writable",
@@ -64,6 +67,7 @@ __all__ = [
     "surface_format",
     "volume_files",
     "volume_format",
+    "who_writes",
     "write_mesh",
     "write_overlay",
     "write_series",

@@ -1,23 +1,45 @@
-"""Outputs that appear whole or not at all: written beside their final names in a hidden folder, then renamed."""
+"""Outputs that appear whole or not at all: written beside their final names in a hidden folder, then renamed.
+
+The hidden folder holds a lock for as long as its run lives, so that two runs never write the same outputs at once, and
+so that what a killed run left behind is told from what a living one is writing. It also says who writes, and how far
+that is.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import socket
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
-from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.errors import BusyError, DataError, RefusedError
 
-# The hidden folders of stages that are entered.
-_OPEN: set[Path] = set()
+# In a hidden folder: the lock, and who holds it.
+_LOCK, _WHO = ".lock", ".running"
+# Seconds within which a lock that is about to be given up can be had: its owner only removes some files meanwhile.
+_PATIENCE = 0.2
+
+# The hidden folders of stages that are entered, with their locks.
+_OPEN: dict[Path, Any] = {}
 
 
 def abandon() -> None:
     """Leave no trace of what is being written: for a process that is about to end."""
     for folder in list(_OPEN):
-        shutil.rmtree(folder, ignore_errors=True)
+        _give_up(folder)
+
+
+def who_writes(mark: Path) -> dict[str, Any] | None:
+    """The run that is writing files whose last is `mark`: its "process", "host" and "phase"; None where none tells."""
+    try:
+        return json.loads((_hidden(Path(mark)) / _WHO).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
 
 
 class Stage:
@@ -33,28 +55,31 @@ class Stage:
     inputs: files that no output may replace.
 
     Construction raises RefusedError where an output exists (without `overwrite`), is an input or a folder, stands
-    twice in the list, or where its folder is missing or not writable. Leaving without `commit` leaves no trace.
+    twice in the list, or where its folder is missing or not writable. Entering raises BusyError where another run is
+    writing them, on this machine or, where the file system's locks reach so far, on another. Leaving without `commit`
+    leaves no trace.
     """
 
     def __init__(self, finals: Iterable[Path], *, overwrite: bool = False, inputs: Iterable[Path] = ()) -> None:
         self._finals = [Path(final) for final in finals]
+        self._inputs = [Path(source) for source in inputs]
+        self._overwrite = overwrite
+        self._held: list[Path] = []
         _require_distinct(self._finals)
-        sources = [Path(source) for source in inputs]
-        for final in self._finals:
-            _require_free(final, overwrite, sources)
+        self._require_free()
 
     def __enter__(self) -> Stage:
-        # A folder of this name is what a killed run left behind.
-        self._clear()
-        for folder in self._folders():
-            try:
-                _OPEN.add(folder)
-                folder.mkdir()
-            except OSError as error:
-                self._clear()
-                raise RefusedError(
-                    f"{folder.parent}: cannot be written to ({error.strerror}); choose another folder for the output"
-                ) from error
+        try:
+            for folder, final in self._folders().items():
+                _claim(folder, final)
+                self._held.append(folder)
+            self._require_free()  # another run may have ended since
+            for folder in self._held:
+                _empty(folder)
+            self.tell("starting")
+        except BaseException:
+            self._clear()
+            raise
         return self
 
     def __exit__(
@@ -65,6 +90,13 @@ class Stage:
     def path(self, final: Path) -> Path:
         """Where to write the file that will be `final`: the same name in the hidden folder beside it."""
         return self._folder(Path(final).parent) / Path(final).name
+
+    def tell(self, phase: str) -> None:
+        """Say how far the run is, for `who_writes`."""
+        who = {"process": os.getpid(), "host": socket.gethostname(), "phase": phase}
+        for folder in self._held:
+            with suppress(OSError):  # a disk that is full is told where outputs are written
+                (folder / _WHO).write_text(json.dumps(who), encoding="utf-8")
 
     def commit(self) -> None:
         """Give every file its final name, in the order given; raises DataError where one is missing or stuck."""
@@ -79,18 +111,95 @@ class Stage:
             except OSError as error:
                 raise DataError(f"{final}: cannot be put in place ({error.strerror}); check the disk") from error
 
+    def sweep(self) -> None:
+        """Remove what killed runs left of these outputs, unless another run is writing them."""
+        for folder, mark in self._folders().items():
+            if folder.exists():
+                with suppress(RefusedError):
+                    _claim(folder, mark)
+                    _give_up(folder)
+
+    def _require_free(self) -> None:
+        """Raise RefusedError where an output cannot be made, or stands in the way.
+
+        What a run has put in place that was killed before its mark, which still lies in the hidden folder, does not.
+        """
+        unfinished = bool(self._finals) and self.path(self._finals[-1]).exists() and not self._finals[-1].exists()
+        for final in self._finals:
+            _require_free(final, self._overwrite or unfinished, self._inputs)
+
     def _clear(self) -> None:
-        for folder in self._folders():
-            shutil.rmtree(folder, ignore_errors=True)
-            _OPEN.discard(folder)
+        while self._held:
+            _give_up(self._held.pop())
 
     def _folder(self, parent: Path) -> Path:
-        # Named after a file that is made there, so that runs which share a folder do not meet in it.
-        first = next(final for final in self._finals if final.parent.resolve() == parent.resolve())
-        return parent.resolve() / f".{first.name}.partial"
+        return next(folder for folder in self._folders() if folder.parent == parent.resolve())
 
-    def _folders(self) -> list[Path]:
-        return list(dict.fromkeys(self._folder(final.parent) for final in self._finals))
+    def _folders(self) -> dict[Path, Path]:
+        """A hidden folder for each folder that is written to, and the last file that is made there.
+
+        Named after that file, so that runs which share a folder do not meet in it.
+        """
+        last = {final.parent.resolve(): final for final in self._finals}
+        return {_hidden(final): final for final in last.values()}
+
+
+def _hidden(final: Path) -> Path:
+    return final.parent.resolve() / f".{final.name}.partial"
+
+
+def _claim(folder: Path, final: Path) -> None:
+    """Make the hidden folder of a file, or take over what a killed run left, and hold its lock.
+
+    Raises BusyError where a living run holds it, RefusedError where it cannot be made.
+    """
+    from filelock import FileLock, Timeout
+
+    while True:
+        try:
+            folder.mkdir(exist_ok=True)
+            lock = FileLock(folder / _LOCK, timeout=_PATIENCE, thread_local=False)
+            lock.acquire()
+        except (FileNotFoundError, FileExistsError):  # its last owner removed the folder just now
+            if folder.parent.is_dir() and not folder.is_file():
+                continue
+            raise RefusedError(
+                f"{folder}: cannot be made; remove what stands there, or choose another folder"
+            ) from None
+        except Timeout:
+            who = who_writes(final) or {}
+            name = f"process {who['process']} on {who['host']}" if who else "of another process"
+            raise BusyError(
+                f"{final}: another run is writing it ({name}); let that one end, or give another name"
+            ) from None
+        except OSError as error:
+            with suppress(OSError):
+                folder.rmdir()
+            raise RefusedError(
+                f"{folder.parent}: cannot be written to ({error.strerror}); choose another folder for the output"
+            ) from error
+        _OPEN[folder] = lock
+        return
+
+
+def _give_up(folder: Path) -> None:
+    """Remove a hidden folder whose lock this process holds, the lock last."""
+    lock = _OPEN.pop(folder)
+    _empty(folder)
+    with suppress(OSError):  # where an open file cannot be removed, the next run takes the folder over
+        (folder / _LOCK).unlink()
+    lock.release()
+    with suppress(OSError):  # another run may be in it already
+        folder.rmdir()
+
+
+def _empty(folder: Path) -> None:
+    for path in list(folder.iterdir()) if folder.is_dir() else []:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        elif path.name != _LOCK:
+            with suppress(OSError):
+                path.unlink()
 
 
 def _require_distinct(finals: list[Path]) -> None:

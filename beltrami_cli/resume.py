@@ -1,0 +1,42 @@
+"""Whether a job has been done already: its outputs are there, from the same inputs, parameters and version."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from beltrami_cli import __version__
+from beltrami_cli.config import Job
+from beltrami_cli.record import request, sha256, sidecar_of, sources_of
+
+
+def finished(job: Job) -> dict[str, Any] | None:
+    """The record of an earlier run that `job` would only repeat; None where there is none, or it did something else.
+
+    A run is the same where its sidecar tells of this version, of what is asked now (`record.request`), and of inputs
+    with the same SHA-256, and where every output that it names is still there; a sidecar is written last, so outputs
+    without one are unfinished. Raises RefusedError where an input is missing.
+    """
+    sources = sources_of(job)
+    sidecar = sidecar_of(job.volume)
+    try:
+        record = json.loads(sidecar.read_text(encoding="utf-8"))
+        same = (
+            record["GeneratedBy"][0]["Version"] == __version__
+            and record["Request"] == json.loads(json.dumps(request(job)))
+            and all(output.is_file() for output in _outputs(record, sidecar))
+            and [(source.get("Role"), source["SHA256"]) for source in record["Sources"]]
+            == [(role, sha256(path)) for path, role in sources]
+        )
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return None
+    return record if same else None
+
+
+def _outputs(record: Mapping[str, Any], sidecar: Path) -> list[Path]:
+    """Where the outputs are if the study has moved since, with its sidecars."""
+    *_, then = record["Outputs"]
+    return [sidecar.parent / os.path.relpath(output, os.path.dirname(then)) for output in record["Outputs"]]
