@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
+from decimal import Decimal
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ MOST_DEPTH = 50  # voxels: more than any cortex, and minutes of sampling
 DEFAULT_BAND = 4.0  # half-width in voxels of the largest spacing: the local cubic's stencil is whole inside it
 MOST_STEPS = 1000  # where the data end the run: at the default dt a Gaussian of about 40 voxels FWHM, 50 on a curve
 FWHM_TO_TIME = 1 / (16 * math.log(2))  # heat flow for t mm^2 is a Gaussian of FWHM sqrt(16 ln 2 t) mm
+_MEMORY = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*([KMGT]?)(I?)B?\s*", re.ASCII | re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,22 @@ def parse_depth(given: Any) -> tuple[float, float]:
             f"depth: found {given!r}; expected A:B in mm along the normal, A no larger than B, as in -2:2"
         )
     return first, last
+
+
+def parse_memory(given: Any) -> int:
+    """Bytes from "8G", "8GB", "500M" (powers of 1000), "8GiB" (powers of 1024) or a number of bytes.
+
+    Raises RefusedError for anything else, and for less than one byte.
+    """
+    match = _MEMORY.fullmatch(given) if isinstance(given, str) else None
+    size = 0
+    if isinstance(given, Integral) and not isinstance(given, bool):
+        size = int(given)
+    elif match and (match[2] or not match[3]):
+        size = int(Decimal(match[1]) * (1024 if match[3] else 1000) ** " KMGT".index(match[2].upper() or " "))
+    if size < 1:
+        raise RefusedError(f"memory: found {given!r}; expected an amount above 0: 8G, 500M, 2GiB, or a number of bytes")
+    return size
 
 
 @dataclass(frozen=True)
@@ -387,6 +406,7 @@ class Job:
     weights: how much each voxel or vertex counts (>= 0); mask: which count at all (not 0). filled: where the mask of
     what the run filled in is written. on: surfaces, and where values at their vertices are written. structure: in
     GIFTI's names, of what is written. spacing: mm, of .npy inputs; for values at vertices, of the band's voxels.
+    memory: bytes that the run may need, None for any amount, see `parse_memory`; it changes no result.
     """
 
     data: Path
@@ -406,8 +426,11 @@ class Job:
     resample: bool = False
     overwrite: bool = False
     settings: Settings = field(default_factory=Settings)
+    memory: int | None = None
 
     def __post_init__(self) -> None:
+        if self.memory is not None:
+            object.__setattr__(self, "memory", parse_memory(self.memory))
         if self.settings.flat and self.levelset is not None:
             raise RefusedError("flat: there is no surface, so LEVELSET is omitted: beltrami denoise --flat DATA -o OUT")
         if not self.settings.flat and self.levelset is None:
@@ -449,32 +472,48 @@ KEYS: dict[str, dict[str, str]] = {
     "time": {k: k for k in ("iterations", "time", "fwhm", "stop", "noise_sigma", "seed")},
     "band": {"half_width": "band", **{k: k for k in ("extension", "extend_every", "depth")}},
     "values": {k: k for k in ("kind", "period", "independent")},
-    "run": {"threads": "threads"},
+    "run": {k: k for k in ("threads", "memory")},
 }
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """The fields that a TOML file sets, paths made relative to the file.
+    """The fields that the TOML file of one run sets, paths made relative to the file.
 
-    Raises RefusedError where the file is missing, is not TOML, or has an unknown section or key.
+    Raises RefusedError as `read_tables` and `fields_of`, and where the file has [for_each], which makes many runs.
     """
+    tables = read_tables(path)
+    if "for_each" in tables:
+        raise RefusedError(
+            f"{path}: has [for_each], which makes many runs; expected a config of one run: for many, beltrami batch "
+            f"{path}"
+        )
+    return fields_of(path, tables)
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """What a TOML file holds, as it stands there; raises RefusedError where it is missing or is not TOML."""
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise RefusedError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RefusedError(f"{path}: not a valid TOML file ({error}); correct it") from error
+
+
+def fields_of(path: Path, tables: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields that the tables of a config set, their paths made relative to `path`, the config's file.
+
+    Raises RefusedError for an unknown section or key, and for a value that its field cannot hold.
+    """
     given: dict[str, Any] = {}
     for section, table in tables.items():
-        if section == "for_each":
-            raise RefusedError(f"{path}: has [for_each], which makes many runs; expected a config of one run")
         if section not in KEYS:
-            raise RefusedError(f"{path}: unknown section [{section}]{_nearest(section, KEYS)}")
+            raise RefusedError(f"{path}: unknown section [{section}]{nearest(section, [*KEYS, 'for_each'])}")
         if not isinstance(table, dict):
             raise RefusedError(f"{path}: found {section!r} as a key or a list; expected a section [{section}]")
         for key, value in table.items():
             if key not in KEYS[section]:
-                raise RefusedError(f"{path}: unknown key {key!r} in [{section}]{_nearest(key, KEYS[section])}")
+                raise RefusedError(f"{path}: unknown key {key!r} in [{section}]{nearest(key, KEYS[section])}")
             given[KEYS[section][key]] = _from_toml(path, section, key, value)
     return given
 
@@ -533,7 +572,7 @@ def parse_on(given: str, folder: Path = Path()) -> tuple[Path, Path]:
     Raises RefusedError for anything else.
     """
     surface, equals, file = (part.strip() for part in given.partition("="))
-    if not (surface and equals and file):
+    if not (surface and equals and file) or "\0" in given:
         raise RefusedError(f"on: found {given!r}; expected SURFACE=FILE, as in lh.mid.surf.gii=lh.map.func.gii")
     return folder / surface, folder / file
 
@@ -590,11 +629,13 @@ def _text(where: str, value: Any) -> str:
 
 
 def _path(config: Path, where: str, value: Any) -> Path:
-    if not isinstance(value, str) or not value:
+    if not isinstance(value, str) or not value or "\0" in value:
         raise RefusedError(f"{where}: found {value!r}; expected the name of a file")
     return config.parent / value
 
 
-def _nearest(name: str, known: Mapping[str, Any]) -> str:
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The end of a message about an unknown name: the known one that is most like it, or all of them."""
+    known = list(known)
     close = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {close[0]!r}?" if close else f"; expected one of {', '.join(known)}"

@@ -105,7 +105,7 @@ class Solver:
     ) -> None:
         require_usable(grid, "the grid")
         self.grid, self.settings, self.phases, self.warnings = grid, settings, phases, warnings
-        numba.set_num_threads(min(settings.threads or _cpus(), numba.config.NUMBA_NUM_THREADS))
+        numba.set_num_threads(min(settings.threads or cpus(), numba.config.NUMBA_NUM_THREADS))
         iterations, dt, ends_by = settings.duration(time_step(grid, settings))
         self.planner = Planner(settings, iterations, ends_by, phases, warnings)
         self.places: Voxels | Vertices
@@ -338,7 +338,7 @@ def _within_range(values: np.ndarray, start: Extended, kind: Kind) -> tuple[np.n
     return values, most
 
 
-def _cpus() -> int:
+def cpus() -> int:
     """CPUs that this process may use: a scheduler or container may grant fewer than the machine has."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -25,12 +25,14 @@ from beltrami_cli.cli import beltrami as group
 OPTIONS = {
     "denoise": "-o --mesh --no-mesh --flow --phi --beta --eps --scheme --iterations --time --fwhm --dt --extension "
     "--extend-every --band --spacing --resample --inside --outside --precision --config --threads --flat --overwrite "
-    "--on --labels --between --map --frame --structure",
+    "--on --labels --between --map --frame --structure --memory",
+    "batch": "--jobs --scheduler --resume --dry-run --summary --part --threads --memory --retries --overwrite",
     "levelset": "-o --labels --between --like --spacing --margin --frame --overwrite",
     "sample": "-o --kind --period --missing --frame --structure --spacing --overwrite",
     "mesh": "-o --spacing --resample --inside --overwrite",
     "phantom": "--size --noise --seed --format --overwrite",
-    "compare": "--levelset --within --period --max-abs --max-rms --min-psnr --data-range --json",
+    "compare": "--levelset --within --period --max-abs --max-rms --min-psnr --data-range --max-missing --max-distance "
+    "--include --json",
     "info": "",
     "demo": "--overwrite",
 }

@@ -15,13 +15,16 @@ from beltrami_cli.config import (
     Beta,
     Job,
     Settings,
+    fields_of,
     make_job,
     overlaid,
     parse_beta,
     parse_depth,
+    parse_memory,
     parse_period,
     parse_spacing,
     read_config,
+    read_tables,
 )
 from beltrami_cli.errors import RefusedError
 
@@ -340,6 +343,33 @@ def test_a_given_time_is_met_exactly(total, iterations):
     assert count * dt == pytest.approx(total)
 
 
+@pytest.mark.parametrize(
+    "given, expected",
+    [
+        *[("8G", 8 * 10**9), ("8GB", 8 * 10**9), ("8GiB", 8 * 2**30), ("8Gi", 8 * 2**30), ("500M", 5 * 10**8)],
+        *[("1.5 GB", 15 * 10**8), (" .5kib ", 512), ("2 t", 2 * 10**12), ("1TiB", 2**40), ("0.1K", 100)],
+        *[(4096, 4096), (np.int64(7), 7), ("4096", 4096), ("4096B", 4096), ("1.25M", 1_250_000), ("9.K", 9000)],
+    ],
+)
+def test_memory(given, expected):
+    assert parse_memory(given) == expected
+    job = Job(Path("d.npy"), Path("o.npy"), Path("p.npy"), memory=given)
+    assert (job.memory, type(job.memory)) == (expected, int)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        *["", "G", "8X", "8iB", "-8G", "0", "0G", "0.0001K", "1e9", "8 G B", "8GG", "nan", "inf", "1.2.3G", "٣G"],
+        *[0, -1, 1.5, True, None, [8], {}, math.nan],
+    ],
+    ids=str,
+)
+def test_memory_that_makes_no_sense(given):
+    with pytest.raises(RefusedError, match=r"memory: found .*; expected an amount above 0: 8G, 500M"):
+        parse_memory(given)
+
+
 def test_spacing():
     assert parse_spacing("2") == (2.0,)
     assert parse_spacing("1,2,3") == parse_spacing([1, 2, 3]) == (1.0, 2.0, 3.0)
@@ -466,7 +496,10 @@ def test_inputs_without_weights_and_mask():
         ("[band]\nzzz = 1", ["'zzz'", "half_width, extension, extend_every, depth"]),
         ("[other]\nx = 1", ["[other]", "input, output, flow, time, band, values, run"]),
         ("[[flow]]\nbeta = 1", ["'flow'", "section [flow]"]),
-        ("[for_each]\nsubject = ['01']", ["[for_each]", "one run"]),
+        ("[for_each]\nsubject = ['01']", ["[for_each]", "one run", "beltrami batch", "run.toml"]),
+        ("[foreach]\nsubject = ['01']", ["[foreach]", "'for_each'"]),
+        ("[run]\nmemory = '8 apples'", ["memory", "'8 apples'", "8G"]),
+        ("[run]\nmemory = -1", ["memory", "-1"]),
         ("[flow]\nbeta = 'x'", ["beta", "'x'"]),
         ("[flow]\nbeta = true", ["beta", "True"]),
         ("[flow]\nname = 3", ["flow", "3"]),
@@ -544,6 +577,32 @@ def test_blanks_around_the_sign_of_on(folder):
 )
 def test_output_section_that_cannot_be(folder, text, word):
     assert word in refused("denoise", "--config", config(folder, FILES, "[output]", text))
+
+
+def test_memory_of_a_config_and_of_the_command_line(folder):
+    path = config(folder, FILES, OUTPUT, "[time]\niterations = 1", "[run]\nmemory = '64GiB'")
+    assert make_job(read_config(path)).memory == 2**36
+    done("denoise", "--config", path, "--no-mesh")
+    assert "memory" not in record(folder / "out.json")["Parameters"]
+    assert "memory: found 'much'" in refused("denoise", "--config", path, "--memory", "much", "--overwrite")
+
+
+@pytest.mark.parametrize(
+    "line, words",
+    [
+        ('data = "a\\u0000b.npy"', "[input] data: found 'a\\x00b.npy'; expected the name of a file"),
+        ('data = "d.npy"\n[output]\nvolume = "o.npy"\non = "s.ply=a\\u0000b.func.gii"', "on: found 's.ply=a\\x00b"),
+    ],
+)
+def test_no_name_of_a_file(folder, line, words):
+    assert words in refused("denoise", "--config", config(folder, "[input]", line))
+
+
+def test_fields_of_tables_that_were_read_before(folder):
+    path = config(folder, FILES, OUTPUT, "[for_each]\nn = [1]")
+    tables = read_tables(path)
+    assert tables.pop("for_each") == {"n": [1]}
+    assert fields_of(path, tables)["data"] == folder / "volumes/data.nii.gz"
 
 
 def test_unreadable_config(folder):

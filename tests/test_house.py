@@ -13,7 +13,7 @@ import beltrami_cli
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-HEAVY = {"SimpleITK", "igl", "matplotlib", "meshio", "nibabel", "numba", "scipy", "skimage", "tqdm", "trimesh"}
+HEAVY = {"SimpleITK", "distributed", "igl", "matplotlib", "meshio", "nibabel", "numba", "scipy", "skimage", "tqdm", "trimesh"}
 
 
 def run(*arguments: str) -> str:
@@ -30,7 +30,7 @@ def imported_packages(folder: str) -> set[str]:
                 names.add(node.module.split(".")[0])
     own = {"beltrami_cli"} | {file.stem for file in (ROOT / folder).glob("*.py")}
     return {
-        {"skimage": "scikit-image", "igl": "libigl"}.get(name, name)
+        {"skimage": "scikit-image", "igl": "libigl", "dask_jobqueue": "dask-jobqueue"}.get(name, name)
         for name in names - set(sys.stdlib_module_names) - own
     }
 
@@ -40,13 +40,14 @@ def names_of(requirements: list[str]) -> set[str]:
 
 
 def test_dependencies_are_what_the_package_imports():
-    optional = names_of(PROJECT["optional-dependencies"]["report"])
+    extras = PROJECT["optional-dependencies"]
+    optional = names_of([*extras["report"], *extras["cluster"]])
     assert imported_packages("beltrami_cli") - optional == names_of(PROJECT["dependencies"])
 
 
 def test_tests_import_nothing_undeclared():
     extras = PROJECT["optional-dependencies"]
-    declared = names_of([*PROJECT["dependencies"], *extras["report"], *extras["dev"]])
+    declared = names_of([*PROJECT["dependencies"], *extras["report"], *extras["cluster"], *extras["dev"]])
     assert imported_packages("tests") - {file.stem for file in (ROOT / "benchmarks").glob("*.py")} <= declared
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from beltrami_cli import __version__
+from beltrami_cli.cli.batch import batch
 from beltrami_cli.cli.common import report_error
 from beltrami_cli.cli.compare import compare
 from beltrami_cli.cli.demo import demo
@@ -35,7 +36,7 @@ def beltrami() -> None:
     """Denoise data that lie on a surface - a level set, a segmentation or a mesh -, above all maps on the cortex."""
 
 
-for command in (denoise, levelset, mesh, sample, phantom, compare, info, demo):
+for command in (denoise, batch, levelset, mesh, sample, phantom, compare, info, demo):
     beltrami.add_command(command)
 
 

@@ -178,6 +178,9 @@ class Denoise(Command):
     "--precision", type=click.Choice(["float32", "float64"]), help="Of computation and OUT. Default: float32."
 )
 @click.option("--threads", type=int, help="Default: the CPUs that the process may use.")
+@click.option(
+    "--memory", metavar="LIMIT", help="Refuse a run that is estimated to need more than this: 8G, 500M. Default: none."
+)
 def denoise(inputs: tuple[Path, ...], config: Path | None, quiet: bool, verbose: int, **options: Any) -> int:
     """Denoise DATA along the surface where LEVELSET is zero, keeping edges.
 

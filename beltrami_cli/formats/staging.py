@@ -21,6 +21,8 @@ from beltrami_cli.errors import BusyError, DataError, RefusedError
 
 # In a hidden folder: the lock, and who holds it.
 _LOCK, _WHO = ".lock", ".running"
+# Bytes of what is told, padded, so that a shorter phase covers a longer one.
+_LINE = 400
 # Seconds within which a lock that is about to be given up can be had: its owner only removes some files meanwhile.
 _PATIENCE = 0.2
 
@@ -65,17 +67,24 @@ class Stage:
         self._inputs = [Path(source) for source in inputs]
         self._overwrite = overwrite
         self._held: list[Path] = []
+        self._who: list[int] = []  # files, kept open: phases come often, and opening takes long on a network's disk
         _require_distinct(self._finals)
+        # A hidden folder for each folder that is written to, named after the last file that is made there, so that
+        # runs which share a folder do not meet in it.
+        last = {final.parent.resolve(): final for final in self._finals}
+        self._folders = {_hidden(final): final for final in last.values()}
         self._require_free()
 
     def __enter__(self) -> Stage:
         try:
-            for folder, final in self._folders().items():
+            for folder, final in self._folders.items():
                 _claim(folder, final)
                 self._held.append(folder)
             self._require_free()  # another run may have ended since
             for folder in self._held:
                 _empty(folder)
+                with suppress(OSError):  # a disk that is full is told where outputs are written
+                    self._who.append(os.open(folder / _WHO, os.O_WRONLY | os.O_CREAT, 0o644))
             self.tell("starting")
         except BaseException:
             self._clear()
@@ -93,10 +102,11 @@ class Stage:
 
     def tell(self, phase: str) -> None:
         """Say how far the run is, for `who_writes`."""
-        who = {"process": os.getpid(), "host": socket.gethostname(), "phase": phase}
-        for folder in self._held:
-            with suppress(OSError):  # a disk that is full is told where outputs are written
-                (folder / _WHO).write_text(json.dumps(who), encoding="utf-8")
+        who = json.dumps({"process": os.getpid(), "host": socket.gethostname(), "phase": phase})
+        for file in self._who:
+            with suppress(OSError):
+                os.lseek(file, 0, os.SEEK_SET)
+                os.write(file, who.ljust(_LINE).encode())
 
     def commit(self) -> None:
         """Give every file its final name, in the order given; raises DataError where one is missing or stuck."""
@@ -113,7 +123,7 @@ class Stage:
 
     def sweep(self) -> None:
         """Remove what killed runs left of these outputs, unless another run is writing them."""
-        for folder, mark in self._folders().items():
+        for folder, mark in self._folders.items():
             if folder.exists():
                 with suppress(RefusedError):
                     _claim(folder, mark)
@@ -129,19 +139,13 @@ class Stage:
             _require_free(final, self._overwrite or unfinished, self._inputs)
 
     def _clear(self) -> None:
+        while self._who:
+            os.close(self._who.pop())
         while self._held:
             _give_up(self._held.pop())
 
     def _folder(self, parent: Path) -> Path:
-        return next(folder for folder in self._folders() if folder.parent == parent.resolve())
-
-    def _folders(self) -> dict[Path, Path]:
-        """A hidden folder for each folder that is written to, and the last file that is made there.
-
-        Named after that file, so that runs which share a folder do not meet in it.
-        """
-        last = {final.parent.resolve(): final for final in self._finals}
-        return {_hidden(final): final for final in last.values()}
+        return next(folder for folder in self._folders if folder.parent == parent.resolve())
 
 
 def _hidden(final: Path) -> Path:

@@ -1,0 +1,374 @@
+"""Many jobs: each on its own, as many at once as processes and memory allow, none twice, none lost."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor, Future
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Literal
+
+from beltrami_cli import __version__, executors, formats
+from beltrami_cli.config import Job
+from beltrami_cli.errors import BeltramiError, BusyError, RefusedError
+from beltrami_cli.memory import needed, told
+from beltrami_cli.record import forget_peak_memory, sidecar_of
+from beltrami_cli.resume import finished
+from beltrami_cli.study import Planned
+
+Status = Literal["done", "skipped", "failed", "busy"]
+
+# Seconds between two looks at what runs, for those who watch.
+_LOOK = 0.5
+# Seconds between two tries of a job whose outputs another run is writing.
+_TRY_AGAIN = 2.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of a job.
+
+    seconds: of the run, as its sidecar says. noise_before, noise_after: standard deviation in data units, of several
+    channels the root of their mean square; None where unknown. tries: how often it was started. reason: why it failed.
+    """
+
+    job: str
+    config: str
+    output: str
+    status: Status
+    seconds: float | None = None
+    noise_before: float | None = None
+    noise_after: float | None = None
+    iterations: int | None = None
+    stop_reason: str | None = None
+    warnings: tuple[str, ...] = ()
+    tries: int = 0
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """How a batch deals with what is there and with what goes wrong.
+
+    resume: jobs that are done already are skipped, others replace what is there. overwrite: all replace what is there.
+    retries: how often a job is started anew whose process died. memory: bytes that all jobs at once may be estimated
+    to need; None for as much as `spare`, where a job that is alone may need more. spare: bytes that are free.
+    at_once: jobs; None for as many as there are, where the executor has a queue and limits of its own.
+    """
+
+    resume: bool = False
+    overwrite: bool = False
+    retries: int = 2
+    memory: int | None = None
+    spare: int | None = None
+    at_once: int | None = 1
+
+
+@dataclass(frozen=True)
+class Running:
+    """A job that is running now, or waits for another run (`busy`). since: seconds of `time.monotonic`."""
+
+    planned: Planned
+    since: float
+
+    @property
+    def phase(self) -> str:
+        return (formats.who_writes(sidecar_of(self.planned.job.volume)) or {}).get("phase", "")
+
+
+def run(
+    study: Sequence[Planned],
+    executor: Executor,
+    policy: Policy,
+    *,
+    settled: Callable[[Row], None] = lambda row: None,
+    watch: Callable[[list[Running]], None] = lambda running: None,
+) -> list[Row]:
+    """What became of every job of the study, in its order; no job's failure stops another.
+
+    settled: called with each row once it is final. watch: called about twice a second with what is running.
+    """
+    return _Batch(study, executor, policy, settled, watch).run()
+
+
+class _Batch:
+    def __init__(
+        self,
+        study: Sequence[Planned],
+        executor: Executor,
+        policy: Policy,
+        settled: Callable[[Row], None],
+        watch: Callable[[list[Running]], None],
+    ) -> None:
+        self.study, self.executor, self.policy, self.settled, self.watch = study, executor, policy, settled, watch
+        self.waiting = deque(range(len(study)))
+        self.busy: deque[tuple[float, int]] = deque()  # when to try again, and which job
+        self.running: dict[Future[Row], int] = {}
+        self.done: SimpleQueue[Future[Row]] = SimpleQueue()
+        self.since: dict[int, float] = {}
+        self.taken: dict[int, int] = {}  # bytes by job
+        self.tries = [0] * len(study)
+        self.rows: list[Row | None] = [None] * len(study)
+
+    def run(self) -> list[Row]:
+        while self.waiting or self.running or self.busy:
+            self._start()
+            with suppress(Empty):
+                self._take(self.done.get(timeout=_LOOK))
+                while True:
+                    self._take(self.done.get_nowait())
+            self.watch([Running(self.study[k], self.since[k]) for k in self.running.values()])
+        return [row for row in self.rows if row is not None]
+
+    def _start(self) -> None:
+        """Start jobs while there is room for them, those that wait for another run last."""
+        now = time.monotonic()
+        while not self._is_full():
+            if self.waiting:
+                k = self.waiting[0]
+            elif self.busy and self.busy[0][0] <= now:
+                k = self.busy[0][1]
+            else:
+                return
+            try:
+                if not self._has_room(k):
+                    return
+                if not self.tries[k]:
+                    _require_free(self.study[k].job, self.policy)
+            except BeltramiError as error:
+                self._pop()
+                self._settle(k, Row(*self._names(k), "failed", reason=str(error)))
+                continue
+            self._pop()
+            self._submit(k)
+
+    def _pop(self) -> None:
+        if self.waiting:
+            self.waiting.popleft()
+        else:
+            self.busy.popleft()
+
+    def _submit(self, k: int) -> None:
+        policy = self.policy
+        job = replace(self.study[k].job, overwrite=policy.overwrite or policy.resume)
+        # A second try finds what the first one finished.
+        look = policy.resume or not policy.overwrite or self.tries[k] > 0
+        limit = policy.memory if policy.at_once is None else None
+        self.tries[k] += 1
+        self.since[k] = time.monotonic()
+        try:
+            future = self.executor.submit(perform, replace(self.study[k], job=job), look, limit, __version__)
+        except Exception as error:  # the executor itself is lost
+            future = Future()
+            future.set_exception(error)
+        self.running[future] = k
+        future.add_done_callback(self.done.put)
+
+    def _is_full(self) -> bool:
+        return self.policy.at_once is not None and len(self.running) >= self.policy.at_once
+
+    def _has_room(self, k: int) -> bool:
+        """True where the job fits beside those that run; raises RefusedError where it never will, and as `needed`."""
+        if self.policy.at_once is None:
+            return True  # every worker looks for itself
+        if k not in self.taken:
+            self.taken[k] = needed(self.study[k].job)
+        if self.policy.memory is not None:
+            _require_memory(self.taken[k], self.policy.memory)
+        limit = self.policy.memory if self.policy.memory is not None else self.policy.spare
+        others = sum(self.taken[other] for other in self.running.values())
+        return not self.running or limit is None or others + self.taken[k] <= limit
+
+    def _take(self, future: Future[Row]) -> None:
+        """What a job came to: settled, or to be tried again."""
+        k = self.running.pop(future)
+        error = None if future.cancelled() else future.exception()
+        if future.cancelled() or error is not None:
+            # Dask's KilledWorker tells of as many deaths as the scheduler allows, and one more.
+            self.tries[k] += getattr(error, "allowed_failures", 0)
+            if self.tries[k] <= self.policy.retries:
+                self.waiting.append(k)
+            else:
+                self._settle(k, Row(*self._names(k), "failed", reason=_lost(self.tries[k], error)))
+            return
+        row = future.result()
+        if row.status == "busy" and self.policy.resume:
+            self.tries[k] -= 1
+            self.busy.append((time.monotonic() + _TRY_AGAIN, k))
+        elif row.status == "busy":
+            self._settle(k, replace(row, status="failed"))
+        elif row.status == "skipped" and not self.policy.resume:
+            self._settle(k, replace(row, status="done"))
+        else:
+            self._settle(k, row)
+
+    def _settle(self, k: int, row: Row) -> None:
+        self.rows[k] = row = replace(row, tries=self.tries[k])
+        self.settled(row)
+
+    def _names(self, k: int) -> tuple[str, str, str]:
+        return _names(self.study[k])
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a batch would do with a job: "run", "skip" or "fail", why it would fail, and the memory it would need."""
+
+    what: str
+    reason: str = ""
+    memory: int | None = None
+
+
+def foresee(planned: Planned, policy: Policy) -> Plan:
+    """What a batch with this policy would do with a job, from headers, and with `resume` from the inputs' hashes."""
+    try:
+        if policy.resume and finished(planned.job) is not None:
+            return Plan("skip")
+        size = needed(planned.job)
+        _require_free(planned.job, policy)
+        if policy.memory is not None:
+            _require_memory(size, policy.memory)
+    except BeltramiError as error:
+        return Plan("fail", str(error))
+    return Plan("run", "", size)
+
+
+def perform(planned: Planned, look: bool, limit: int | None, version: str) -> Row:
+    """Do a job in this process, and say what became of it; never raises.
+
+    look: skip it where it is done already. limit: bytes that it may be estimated to need. version: of the program that
+    asks; another here is refused.
+    """
+    names = _names(planned)
+    warnings: list[str] = []
+    try:
+        with executors.alone:
+            if version != __version__:
+                raise RefusedError(f"worker: has beltrami_cli {__version__}; expected {version}: install the same")
+            record, status = _record_of(planned.job, look, limit, warnings)
+    except BusyError as error:
+        return Row(*names, "busy", reason=str(error))
+    except BeltramiError as error:
+        return Row(*names, "failed", warnings=tuple(warnings), reason=str(error))
+    except MemoryError:
+        return Row(*names, "failed", warnings=tuple(warnings), reason="out of memory; use a smaller band, or --jobs")
+    except Exception as error:
+        reason = f"unexpected {type(error).__name__}: {' '.join(str(error).split()) or 'no message'} (please report it)"
+        return Row(*names, "failed", warnings=tuple(warnings), reason=reason)
+    return Row(*names, status, **_figures(record))
+
+
+def _record_of(job: Job, look: bool, limit: int | None, warnings: list[str]) -> tuple[dict[str, Any], Status]:
+    """The job's record, and whether it was done or skipped."""
+    from beltrami_cli import pipeline
+
+    record = finished(job) if look else None
+    if record is not None:
+        formats.Stage(map(Path, record["Outputs"]), overwrite=True).sweep()
+        return record, "skipped"
+    limits = [size for size in (limit, executors.own_memory()) if size is not None]
+    if limits:
+        _require_memory(needed(job), min(limits))
+    if job.settings.threads is None:
+        job = replace(job, settings=replace(job.settings, threads=executors.own_threads()))
+    _make_folders(job)
+    forget_peak_memory()
+    return pipeline.run(job, notify=warnings.append).record, "done"
+
+
+def _make_folders(job: Job) -> None:
+    """Make the folders of the outputs, once the inputs are there."""
+    for path in job.all_inputs:
+        formats.require_file(path)
+    outputs = (job.volume, *(job.mesh or ()), job.filled, *(file for _, file in job.on))
+    for folder in {output.parent for output in outputs if output is not None}:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RefusedError(
+                f"{folder}: cannot be made ({error.strerror}); choose another folder for the output"
+            ) from error
+
+
+def _require_free(job: Job, policy: Policy) -> None:
+    if policy.resume or policy.overwrite:
+        return
+    for final in (job.volume, sidecar_of(job.volume)):
+        if final.exists() and formats.who_writes(sidecar_of(job.volume)) is None:
+            raise RefusedError(f"{final}: exists already; --resume skips what is done, --overwrite replaces it")
+
+
+def _require_memory(size: int, limit: int) -> None:
+    if size > limit:
+        raise RefusedError(
+            f"memory: needs about {told(size)}; found a limit of {told(limit)}: give more (--memory), or crop the "
+            "volumes to the surface"
+        )
+
+
+def _names(planned: Planned) -> tuple[str, str, str]:
+    return planned.name, str(planned.config), str(planned.job.volume)
+
+
+def _figures(record: dict[str, Any]) -> dict[str, Any]:
+    """Of a record, what a row tells."""
+    noise = record["Noise"]
+    return {
+        "seconds": round(sum(record["Seconds"].values()), 3),
+        "noise_before": _mean(noise.get("sd")),
+        "noise_after": _mean(noise.get("after")),
+        "iterations": record["Iterations"],
+        "stop_reason": record["StopReason"],
+        "warnings": tuple(record["Warnings"]),
+    }
+
+
+def _mean(per_channel: Iterable[float | None] | None) -> float | None:
+    """The root of the mean square of the known ones."""
+    known = [sd for sd in per_channel or () if sd is not None]
+    return math.sqrt(sum(sd * sd for sd in known) / len(known)) if known else None
+
+
+def _lost(tries: int, error: BaseException | None) -> str:
+    why = "the connection was lost" if error is None else " ".join(str(error).split()) or type(error).__name__
+    return (
+        f"its process died, {tries} {'time' if tries == 1 else 'times'} of {tries} ({why}): out of memory, or killed? "
+        "Give it more memory, or run fewer jobs at once"
+    )
+
+
+def write_summary(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows as .csv or .json, replacing what is there; raises RefusedError for another suffix."""
+    text = _as_csv(rows) if summary_format(path) == "csv" else _as_json(rows)
+    with formats.Stage([path], overwrite=True) as stage, formats.writing(path):
+        stage.path(path).write_text(text, encoding="utf-8", newline="")
+        stage.commit()
+
+
+def summary_format(path: Path) -> str:
+    """csv or json; raises RefusedError for another suffix."""
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".json"):
+        raise RefusedError(f"summary: found {path}; expected a name that ends in .csv or .json")
+    return suffix[1:]
+
+
+def _as_json(rows: Sequence[Row]) -> str:
+    return json.dumps([asdict(row) for row in rows], indent=2, allow_nan=False) + "\n"
+
+
+def _as_csv(rows: Sequence[Row]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(Row.__dataclass_fields__), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({**asdict(row), "warnings": " | ".join(row.warnings)})
+    return text.getvalue()

@@ -1,0 +1,221 @@
+"""beltrami batch: many jobs from configs, here or on a cluster."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from beltrami_cli.cli.common import Command, announce_compilation, note, overwrite_option, say
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from beltrami_cli.batch import Policy, Row, Running
+    from beltrami_cli.study import Planned
+
+FILE = click.Path(path_type=Path)
+
+# Jobs whose phase is shown beside the bar: more do not fit a line, and each is a look at the disk.
+MOST_SHOWN = 3
+
+
+@click.command(cls=Command)
+@click.argument("configs", nargs=-1, required=True, type=FILE, metavar="CONFIG...")
+@click.option("--jobs", type=click.IntRange(1), metavar="N", help="Jobs at once on this machine. Default: 1.")
+@click.option(
+    "--scheduler", metavar="ADDRESS", help="Run on a Dask cluster: its scheduler's address, or its .json file."
+)
+@click.option("--resume", is_flag=True, help="Skip jobs that are done already; redo the others.")
+@click.option("--dry-run", is_flag=True, help="Print what would be run, and run nothing.")
+@click.option("--summary", type=FILE, metavar="FILE", help="Write the final table as .csv or .json.")
+@click.option("--part", metavar="K/N", help="Only every N-th job from the K-th: for a scheduler's array of jobs.")
+@click.option("--threads", type=click.IntRange(1), help="Of each job. Default: the CPUs shared by the jobs at once.")
+@click.option(
+    "--memory",
+    metavar="LIMIT",
+    help="Start jobs only while they are estimated to need less together: 8G, 500M. Default: what is free.",
+)
+@click.option(
+    "--retries",
+    type=click.IntRange(0),
+    default=2,
+    show_default=True,
+    help="How often a job is started again whose process died.",
+)
+@overwrite_option
+def batch(
+    configs: tuple[Path, ...],
+    jobs: int | None,
+    scheduler: str | None,
+    resume: bool,
+    dry_run: bool,
+    summary: Path | None,
+    part: str | None,
+    threads: int | None,
+    memory: str | None,
+    retries: int,
+    overwrite: bool | None,
+    quiet: bool,
+    verbose: int,
+) -> int:
+    """Run the jobs of TOML configs: each as denoise --config would, one's failure not stopping the others.
+
+    A config with [for_each] makes many: every {NAME} in its texts is replaced.
+
+    \b
+        [for_each]
+        subject = ["01", "02"]
+        [input]
+        levelset = "sub-{subject}/psi.nii.gz"
+        data = "sub-{subject}/angle.nii.gz"
+        [output]
+        volume = "out/sub-{subject}_angle.nii.gz"
+
+    \b
+        beltrami batch study.toml --dry-run
+        beltrami batch study.toml --jobs 4 --resume --summary study.csv
+
+    Folders of outputs are made. Exit code 1 where a job failed; its reason stands in the table.
+    """
+    from beltrami_cli import study as studies
+    from beltrami_cli.batch import Policy, run, summary_format, write_summary
+    from beltrami_cli.config import parse_memory
+    from beltrami_cli.formats import Stage
+    from beltrami_cli.memory import available
+
+    if resume and overwrite:
+        raise click.UsageError("--resume keeps what is done and --overwrite replaces it; give one of them")
+    if scheduler is not None and jobs is not None:
+        raise click.UsageError("--jobs is for this machine and --scheduler for a cluster; give one of them")
+    study = studies.read_study(configs)
+    if part is not None:
+        study = studies.part(study, part)
+    limit = None if memory is None else parse_memory(memory)
+    at_once = None if scheduler is not None else min(jobs or 1, max(len(study), 1))
+    policy = Policy(resume, bool(overwrite), retries, limit, available(), at_once)
+    if dry_run:
+        return _tell_plan(study, policy, quiet)
+    if summary is not None:
+        summary_format(summary)
+        Stage([summary], overwrite=policy.resume or policy.overwrite, inputs=configs)
+    announce_compilation(quiet)
+    study = _with_threads(study, threads, at_once)
+    with _executor(scheduler, at_once, study) as executor, _Progress(len(study), quiet) as progress:
+        rows = run(study, executor, policy, settled=progress.settled, watch=progress.watch)
+    _tell_rows(rows, quiet)
+    if summary is not None:
+        write_summary(summary, rows)
+    return 1 if any(row.status == "failed" for row in rows) else 0
+
+
+def _with_threads(study: Sequence[Planned], threads: int | None, at_once: int | None) -> list[Planned]:
+    """The study with threads for each job, where its config says none: of this machine's CPUs a fair share."""
+    from beltrami_cli.solver import cpus
+
+    share = threads if at_once is None else threads or max(1, cpus() // at_once)
+    return [
+        replace(planned, job=replace(planned.job, settings=replace(planned.job.settings, threads=share)))
+        if threads or planned.job.settings.threads is None
+        else planned
+        for planned in study
+    ]
+
+
+def _executor(scheduler: str | None, at_once: int | None, study: Sequence[Planned]) -> AbstractContextManager[Executor]:
+    from beltrami_cli.executors import Processes, cluster
+
+    if scheduler is not None:
+        return cluster(scheduler)
+    most = max((planned.job.settings.threads or 1 for planned in study), default=1)
+    return Processes(at_once or 1, most)
+
+
+class _Progress:
+    """What is seen of a batch while it runs: on a terminal a bar with what runs, else a line for each job."""
+
+    def __init__(self, count: int, quiet: bool) -> None:
+        self.count, self.quiet, self.bar, self.past = count, quiet, None, 0
+        self.on_terminal = not quiet and sys.stderr.isatty()
+
+    def __enter__(self) -> _Progress:
+        if self.on_terminal:
+            from tqdm import tqdm
+
+            self.bar = tqdm(total=self.count, desc="jobs", unit="job", leave=False, file=sys.stderr)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+    def settled(self, row: Row) -> None:
+        self.past += 1
+        line = f"{self.past}/{self.count} {row.job}: {_outcome(row)}"
+        if self.bar is None:
+            note(self.quiet, line)
+            return
+        self.bar.update()
+        if row.status == "failed":
+            self.bar.write(f"beltrami: {line}", file=sys.stderr)
+
+    def watch(self, running: list[Running]) -> None:
+        if self.bar is None:
+            return
+        shown = [f"{one.planned.name}: {one.phase}" for one in running[:MOST_SHOWN]]
+        more = f" and {len(running) - len(shown)} more" if len(running) > len(shown) else ""
+        self.bar.set_postfix_str("; ".join(shown) + more)
+
+
+def _outcome(row: Row) -> str:
+    seconds = "" if row.seconds is None else f", {row.seconds:.1f} s"
+    return f"{row.status}{seconds}" if row.status != "failed" else f"failed: {_short(row.reason)}"
+
+
+def _tell_plan(study: Sequence[Planned], policy: Policy, quiet: bool) -> int:
+    """Print the jobs as they would be run; exit code 1 where one would fail."""
+    from beltrami_cli.batch import foresee
+    from beltrami_cli.memory import told
+
+    plans = [foresee(planned, policy) for planned in study]
+    cells = [("job", "plan", "memory", "output", "")]
+    for planned, plan in zip(study, plans, strict=True):
+        memory = "" if plan.memory is None else told(plan.memory)
+        cells.append((planned.name, plan.what, memory, _short(str(planned.job.volume)), _short(plan.reason)))
+    _tell_table(cells, quiet)
+    counts = Counter(plan.what for plan in plans)
+    say(quiet, f"{len(study)} jobs: " + ", ".join(f"{number} to {what}" for what, number in counts.items()))
+    return 1 if counts["fail"] else 0
+
+
+def _tell_rows(rows: Sequence[Row], quiet: bool) -> None:
+    """Print the final table and its sums."""
+    cells: list[tuple[str, ...]] = [("job", "status", "seconds", "noise before", "after", "stopped by", "")]
+    for row in rows:
+        seconds = "" if row.seconds is None else f"{row.seconds:.1f}"
+        noise = tuple("" if sd is None else f"{sd:.4g}" for sd in (row.noise_before, row.noise_after))
+        cells.append((row.job, row.status, seconds, *noise, row.stop_reason or "", _short(row.reason)))
+    _tell_table(cells, quiet)
+    counts = Counter(row.status for row in rows)
+    warned = sum(bool(row.warnings) for row in rows)
+    told = ", ".join(f"{number} {status}" for status, number in sorted(counts.items()))
+    say(quiet, f"{len(rows)} jobs: {told}" + (f"; {warned} with warnings, see their records" if warned else ""))
+
+
+def _tell_table(cells: Sequence[tuple[str, ...]], quiet: bool) -> None:
+    """Print rows in aligned columns, the last as long as it is."""
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        say(quiet, "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _short(text: str) -> str:
+    """Paths in the working folder as seen from there."""
+    return text.replace(os.getcwd() + os.sep, "")
