@@ -120,7 +120,10 @@ class _Batch:
 
     def run(self) -> list[Row]:
         while self.waiting or self.running or self.busy:
-            self._start()
+            try:
+                self._start()
+            except ConnectionError as error:
+                self._give_up(str(error))
             with suppress(Empty):
                 self._take(self.done.get(timeout=_LOOK))
                 while True:
@@ -150,6 +153,13 @@ class _Batch:
             self._pop()
             self._submit(k)
 
+    def _give_up(self, reason: str) -> None:
+        """Nothing more can be started."""
+        for k in (*self.waiting, *(k for _, k in self.busy)):
+            self._settle(k, Row(*self._names(k), "failed", reason=reason))
+        self.waiting.clear()
+        self.busy.clear()
+
     def _pop(self) -> None:
         if self.waiting:
             self.waiting.popleft()
@@ -157,10 +167,11 @@ class _Batch:
             self.busy.popleft()
 
     def _submit(self, k: int) -> None:
-        policy = self.policy
-        job = replace(self.study[k].job, overwrite=policy.overwrite or policy.resume)
+        policy, job = self.policy, self.study[k].job
+        replaces = policy.overwrite or job.overwrite
         # A second try finds what the first one finished.
-        look = policy.resume or not policy.overwrite or self.tries[k] > 0
+        look = policy.resume or not replaces or self.tries[k] > 0
+        job = replace(job, overwrite=replaces or policy.resume)
         limit = policy.memory if policy.at_once is None else None
         self.tries[k] += 1
         self.since[k] = time.monotonic()
@@ -173,7 +184,11 @@ class _Batch:
         future.add_done_callback(self.done.put)
 
     def _is_full(self) -> bool:
-        return self.policy.at_once is not None and len(self.running) >= self.policy.at_once
+        most = self.policy.at_once
+        if isinstance(self.executor, executors.Cluster):
+            # One for each worker: where one dies, Dask blames all the jobs that wait there too.
+            most = self.executor.workers()
+        return most is not None and len(self.running) >= most
 
     def _has_room(self, k: int) -> bool:
         """True where the job fits beside those that run; raises RefusedError where it never will, and as `needed`."""
@@ -190,14 +205,15 @@ class _Batch:
     def _take(self, future: Future[Row]) -> None:
         """What a job came to: settled, or to be tried again."""
         k = self.running.pop(future)
-        error = None if future.cancelled() else future.exception()
-        if future.cancelled() or error is not None:
-            # Dask's KilledWorker tells of as many deaths as the scheduler allows, and one more.
-            self.tries[k] += getattr(error, "allowed_failures", 0)
-            if self.tries[k] <= self.policy.retries:
+        error = CancelledError("the connection was lost") if future.cancelled() else future.exception()
+        if error is not None:
+            lost = executors.deaths(error)
+            self.tries[k] += max(lost - 1, 0)
+            if lost and self.tries[k] <= self.policy.retries:
                 self.waiting.append(k)
             else:
-                self._settle(k, Row(*self._names(k), "failed", reason=_lost(self.tries[k], error)))
+                reason = _lost(self.tries[k], error) if lost else _odd(error)
+                self._settle(k, Row(*self._names(k), "failed", reason=reason))
             return
         row = future.result()
         if row.status == "busy" and self.policy.resume:
@@ -299,7 +315,7 @@ def _make_folders(job: Job) -> None:
 
 
 def _require_free(job: Job, policy: Policy) -> None:
-    if policy.resume or policy.overwrite:
+    if policy.resume or policy.overwrite or job.overwrite:
         return
     for final in (job.volume, sidecar_of(job.volume)):
         if final.exists() and formats.who_writes(sidecar_of(job.volume)) is None:

@@ -33,8 +33,12 @@ def test_readme_shows_the_main_commands():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_run(page, tmp_path, monkeypatch):
-    shutil.copytree(ROOT / "sample_data", tmp_path / "sample_data")
+    for name in ("sample_data", "configs", "tests/golden"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("data", "output"))
     monkeypatch.chdir(tmp_path)
+    for block in blocks(page, "toml"):
+        if name := re.match(r"# (\S+\.toml)\n", block):
+            Path(name[1]).write_text(block)
     for command in commands(page):
         run = beltrami(*shlex.split(command, comments=True)[1:])
         assert run.code == 0, f"{command}\n{run.err}"

@@ -149,7 +149,9 @@ class _Progress:
         if self.on_terminal:
             from tqdm import tqdm
 
-            self.bar = tqdm(total=self.count, desc="jobs", unit="job", leave=False, file=sys.stderr)
+            # A short bar: what runs needs the room.
+            line = "{n_fmt}/{total_fmt} jobs |{bar:20}| {elapsed}<{remaining}{postfix}"
+            self.bar = tqdm(total=self.count, bar_format=line, leave=False, file=sys.stderr, dynamic_ncols=True)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -169,7 +171,7 @@ class _Progress:
     def watch(self, running: list[Running]) -> None:
         if self.bar is None:
             return
-        shown = [f"{one.planned.name}: {one.phase}" for one in running[:MOST_SHOWN]]
+        shown = [f"{one.planned.name}: {one.phase or 'starting'}" for one in running[:MOST_SHOWN]]
         more = f" and {len(running) - len(shown)} more" if len(running) > len(shown) else ""
         self.bar.set_postfix_str("; ".join(shown) + more)
 
