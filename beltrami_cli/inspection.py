@@ -1,4 +1,4 @@
-"""Looking at files: how two volumes differ; what a volume, a surface or vertex data holds."""
+"""Looking at files: what a volume, a surface or vertex data holds."""
 
 from __future__ import annotations
 
@@ -7,16 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from beltrami_cli import formats
-from beltrami_cli.config import Settings
 from beltrami_cli.errors import BeltramiError, RefusedError
-from beltrami_cli.grid import Canonical, Grid, Volume, extent, require_same_grid
-from beltrami_cli.inputs import Warnings, band_of, require_usable
+from beltrami_cli.grid import Grid, extent
 from beltrami_cli.levelset import crossing_box, two_values
-from beltrami_cli.metrics import Difference, difference
 from beltrami_cli.sources import is_segmentation
 from beltrami_cli.surface import Mesh, edge_counts
-
-REMEDY = "bring them onto one grid first, for example with denoise --resample"
 
 # Of an overlay with many maps, as of a time series, and of many labels only the first are listed.
 MOST_MAPS = 12
@@ -24,54 +19,6 @@ MOST_LABELS = 12
 
 # mm: no brain is as small, but one in metres is.
 SMALLEST_SURFACE = 1.0
-
-
-def compare_volumes(
-    a: Path,
-    b: Path,
-    *,
-    levelset: Path | None = None,
-    within: float | None = None,
-    period: float | None = None,
-    data_range: float | None = None,
-) -> Difference:
-    """B minus the reference A on one grid, near the surface of `levelset` where it is given (within mm of it).
-
-    Several channels or frames are compared value by value, complex numbers as their real and imaginary part.
-    Raises RefusedError where the grids differ, DataError where nothing can be compared.
-    """
-    psi = None if levelset is None else formats.read_volume(levelset)
-    flat = psi is not None and 1 in psi.grid.shape
-    first, second = (formats.read_volume(path, dtype=np.float64, channels=True, plane=flat) for path in (a, b))
-    require_same_grid(first.grid, f"A {a}", second.grid, f"B {b}", remedy=REMEDY)
-    mask = None
-    if psi is not None:
-        require_same_grid(first.grid, f"A {a}", psi.grid, f"PSI {levelset}", remedy=REMEDY)
-        mask = _near_surface(psi, f"PSI {levelset}", within)
-    x, y = _parts(first), _parts(second)
-    if mask is not None and x.ndim == 4:
-        mask = np.broadcast_to(mask[..., None], x.shape)
-    return difference(x, y, mask=mask, period=period, data_range=data_range)
-
-
-def _parts(volume: Volume) -> np.ndarray:
-    """The values, complex ones as two channels."""
-    data = volume.data
-    return np.stack([data.real, data.imag], -1) if np.iscomplexobj(data) else data
-
-
-def _near_surface(psi: Volume, name: str, within: float | None) -> np.ndarray:
-    """True where a voxel lies within so many mm of the zero level of psi; None for half a voxel."""
-    if within is not None and not 0 < within < np.inf:
-        raise RefusedError(f"within: found {within:g}; expected a distance above 0 mm")
-    require_usable(psi.grid, name)
-    axes = Canonical(psi.grid)
-    widest = float(psi.grid.used_spacing.max())
-    reach = 0.5 * widest if within is None else within
-    # Wider than what is looked at: a band's own rim is where the nearest vertex, not the surface, is in reach.
-    band = band_of(psi.data, Settings(band=reach + 1.5 * widest), axes, Warnings(None))
-    distance = axes.back(band.scatter(np.abs(band.distance), np.inf))
-    return np.asarray(distance <= reach)
 
 
 def describe(path: Path) -> list[str]:

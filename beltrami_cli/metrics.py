@@ -1,4 +1,4 @@
-"""How far two arrays differ: the figures that `beltrami compare` prints and judges."""
+"""How far two arrays or two meshes differ: the figures that `beltrami compare` prints, and the tolerances on them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,44 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.surface import Mesh
 
 # Length of the mean of unit vectors below which their mean direction is left to chance and outliers.
 SPREAD = 0.1
+
+# mm between meshes that are one, where values are judged: float32 keeps the coordinates of a head to 1e-5 mm, text of
+# four decimals to 1e-4, and no value on a cortex changes over a thousandth of a voxel.
+SAME_PLACE = 1e-3
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How far B may be from A; None is no tolerance.
+
+    max_abs, max_rms: of the differences, in data units. min_psnr: dB. max_missing: how many values may be in only one
+    of both. max_distance: mm between meshes; where only others are given, `SAME_PLACE`.
+    Raises RefusedError for what is not a number, and, but for min_psnr, for one below 0.
+    """
+
+    max_abs: float | None = None
+    max_rms: float | None = None
+    min_psnr: float | None = None
+    max_missing: int | None = None
+    max_distance: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, limit in asdict(self).items():
+            if limit is not None and not limit >= (-math.inf if name == "min_psnr" else 0):
+                expected = "a number of dB" if name == "min_psnr" else "0 or more"
+                raise RefusedError(f"tolerance {name.replace('_', '-')}: found {limit:g}; expected {expected}")
+
+    @property
+    def are_of_values(self) -> bool:
+        return any(limit is not None for limit in (self.max_abs, self.max_rms, self.min_psnr, self.max_missing))
+
+    @property
+    def are_given(self) -> bool:
+        return self.are_of_values or self.max_distance is not None
 
 
 @dataclass(frozen=True)
@@ -32,22 +67,65 @@ class Difference:
     psnr: float
     correlation: float
 
-    def exceeds(
-        self, *, max_abs: float | None = None, max_rms: float | None = None, min_psnr: float | None = None
-    ) -> list[str]:
-        """One line for each tolerance that is broken; an empty list where all hold. None is no tolerance."""
+    def exceeds(self, tolerances: Tolerances) -> list[str]:
+        """One line for each tolerance that is broken; an empty list where all hold."""
+        t, missing = tolerances, self.only_in_a + self.only_in_b
         lines = []
-        if max_abs is not None and not self.max_abs <= max_abs:
-            lines.append(f"largest difference {self.max_abs:.6g} is over {max_abs:g}")
-        if max_rms is not None and not self.rms <= max_rms:
-            lines.append(f"rms difference {self.rms:.6g} is over {max_rms:g}")
-        if min_psnr is not None and not self.psnr >= min_psnr:
-            lines.append(f"PSNR {self.psnr:.2f} dB is under {min_psnr:g} dB")
+        if t.max_abs is not None and not self.max_abs <= t.max_abs:
+            lines.append(f"largest difference {self.max_abs:.6g} is over {t.max_abs:g}")
+        if t.max_rms is not None and not self.rms <= t.max_rms:
+            lines.append(f"rms difference {self.rms:.6g} is over {t.max_rms:g}")
+        if t.min_psnr is not None and not self.psnr >= t.min_psnr:
+            lines.append(f"PSNR {self.psnr:.2f} dB is under {t.min_psnr:g} dB")
+        if t.max_missing is not None and missing > t.max_missing:
+            lines.append(
+                f"{missing} values are in only one ({self.only_in_a} in A, {self.only_in_b} in B), over {t.max_missing}"
+            )
         return lines
 
     def as_dict(self) -> dict[str, int | float | None]:
         """The fields by name, for JSON: what is not a finite number there (psnr of equal arrays) is None."""
         return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Between two meshes: how far vertices moved where both have the same triangles, else between the surfaces."""
+
+    max_mm: float
+    rms_mm: float
+    same_triangles: bool
+
+    def exceeds(self, tolerances: Tolerances) -> list[str]:
+        """One line where the largest is over the tolerance, `SAME_PLACE` where only others are given; else none."""
+        if not tolerances.are_given:
+            return []
+        limit = SAME_PLACE if tolerances.max_distance is None else tolerances.max_distance
+        if self.max_mm <= limit:
+            return []
+        what = "vertices moved by up to" if self.same_triangles else "surfaces, of other triangles, are apart by up to"
+        return [f"{what} {self.max_mm:.6g} mm, over {limit:g} mm"]
+
+
+def distance_between(a: Mesh, b: Mesh) -> Distance:
+    """From each vertex to its like with the same triangles (or lines), else from each to the other's triangles.
+
+    These are taken both ways, from all vertices that are on triangles: their largest is the Hausdorff distance as far
+    as vertices see it.
+    """
+    if a.vertices_ras_mm.shape == b.vertices_ras_mm.shape and np.array_equal(a.cells, b.cells):
+        squared, same = ((b.vertices_ras_mm - a.vertices_ras_mm) ** 2).sum(1), True
+    else:
+        squared, same = np.concatenate([_squared_to(a, b), _squared_to(b, a)]), False
+    return Distance(float(np.sqrt(squared.max())), float(np.sqrt(squared.mean())), same)
+
+
+def _squared_to(a: Mesh, b: Mesh) -> np.ndarray:
+    """(N,) mm^2 from the vertices of a's cells to the nearest point on b's."""
+    import igl
+
+    points = a.vertices_ras_mm[np.unique(a.cells)]
+    return np.asarray(igl.point_mesh_squared_distance(points, b.vertices_ras_mm, b.cells.astype(np.int64))[0])
 
 
 def difference(
@@ -82,7 +160,7 @@ def difference(
             f"nothing to compare: of {looked_at.sum()} places looked at, {in_a.sum()} have a value in A and "
             f"{in_b.sum()} in B, none in both"
         )
-    x, y = a[both].astype(float), b[both].astype(float)
+    x, y = a[both].astype(float, copy=False), b[both].astype(float, copy=False)
     with np.errstate(over="ignore", invalid="ignore"):  # near 1e308 a figure may be inf, which breaks any tolerance
         d = y - x if period is None else wrapped(y - x, period)
         rms = float(np.sqrt(np.mean(d**2)))

@@ -1,132 +1,23 @@
-"""compare and info: figures and verdicts that scripts rely on."""
+"""info: what a volume, a surface or vertex data holds, in words."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import nibabel as nib
 import numpy as np
 import pytest
-from command import ball, beltrami, contents, done, nifti, noisy, npy, refused
+from command import ball, beltrami, done, nifti, noisy, npy, refused
 
 
 @pytest.fixture
-def pair(tmp_path: Path) -> tuple[Path, Path, Path]:
-    """LEVELSET, A, and B: A and 2 more within 3 voxels of the surface, 9 more elsewhere."""
-    far = np.abs(ball()) > 3
-    return (
-        nifti(tmp_path / "psi.nii.gz", ball()),
-        nifti(tmp_path / "a.nii.gz", noisy()),
-        nifti(tmp_path / "b.nii.gz", noisy() + np.where(far, 9, 2).astype(np.float32)),
-    )
-
-
-def figures(*arguments: object) -> dict[str, float]:
-    return json.loads(beltrami("compare", *arguments, "--json").out)
-
-
-def test_equal_files(pair):
-    _, a, _ = pair
-    run = done("compare", a, a, "--max-abs", "0", "--max-rms", "0", "--min-psnr", "200")
-    assert "max 0, rms 0, mean 0" in run.out
-    found = figures(a, a)
-    assert (found["compared"], found["max_abs"], found["psnr"], found["broken"]) == (4096, 0.0, None, [])
-
-
-def test_figures(pair):
-    _, a, b = pair
-    near = (np.abs(ball()) <= 3).mean()
-    found = figures(a, b)
-    assert found["max_abs"] == pytest.approx(9, abs=1e-5)
-    assert found["mean"] == pytest.approx(2 * near + 9 * (1 - near), abs=1e-5)
-    assert found["rms"] == pytest.approx(np.sqrt(4 * near + 81 * (1 - near)), abs=1e-5)
-    assert found["data_range"] == pytest.approx(np.ptp(noisy()))
-    assert found["psnr"] == pytest.approx(20 * np.log10(np.ptp(noisy()) / found["rms"]))
-
-
-@pytest.mark.parametrize(
-    "tolerance, code",
-    [
-        (["--max-abs", "8.9"], 1),
-        (["--max-abs", "9.1"], 0),
-        (["--max-rms", "1"], 1),
-        (["--max-rms", "9"], 0),
-        (["--min-psnr", "60"], 1),
-        (["--min-psnr", "60", "--data-range", "100000"], 0),
-        (["--max-abs", "1", "--max-rms", "9"], 1),
-    ],
-)
-def test_tolerances(pair, tolerance, code):
-    _, a, b = pair
-    run = beltrami("compare", a, b, *tolerance)
-    assert run.code == code
-    assert run.err.count("out of tolerance") == code
-    quiet = beltrami("compare", a, b, *tolerance, "-q")
-    assert (quiet.code, quiet.out) == (code, "")
-
-
-@pytest.mark.parametrize("within", [0.3, 0.5, 1.0, 2.0, 2.9])
-def test_near_the_surface_only(pair, within):
-    levelset, a, b = pair
-    found = figures(a, b, "--levelset", levelset, "--within", within)
-    assert found["compared"] == (np.abs(ball()) <= within).sum()
-    assert found["max_abs"] == pytest.approx(2, abs=1e-5)
-    assert figures(a, b, "--levelset", levelset)["compared"] == (np.abs(ball()) <= 0.5).sum()
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_near_a_curve_in_a_slice(tmp_path, axis):
-    plane, values = ball((30, 24), 8.0), noisy((30, 24))
-    levelset, a = (
-        nifti(tmp_path / f"{name}.nii.gz", np.expand_dims(array, axis))
-        for name, array in (("psi", plane), ("a", values))
-    )
-    assert figures(a, a, "--levelset", levelset, "--within", "1.5")["compared"] == (np.abs(plane) <= 1.5).sum()
-    assert figures(a, a, "--levelset", levelset)["compared"] == (np.abs(plane) <= 0.5).sum()
-
-
-def test_near_a_mask(pair, tmp_path):
-    _, a, b = pair
-    mask = nifti(tmp_path / "mask.nii.gz", (ball() < 0).astype(np.uint8))
-    compared = figures(a, b, "--levelset", mask, "--within", "1")["compared"]
-    assert compared == pytest.approx((np.abs(ball()) <= 1).sum(), rel=0.2)
-
-
-def test_angles_wrap(tmp_path):
-    a, b = npy(tmp_path / "a.npy", np.full((8, 8), 359.0)), npy(tmp_path / "b.npy", np.full((8, 8), 1.0))
-    assert figures(a, b)["mean"] == -358
-    assert figures(a, b, "--period", "360")["mean"] == 2
-    assert beltrami("compare", a, b, "--period", "360", "--max-abs", "2").code == 0
-
-
-def test_missing_values_are_counted(tmp_path):
-    values = noisy((8, 8))
-    fewer, others = values.copy(), values.copy()
-    fewer[0], others[:, 0] = np.nan, np.nan
-    found = figures(npy(tmp_path / "a.npy", fewer), npy(tmp_path / "b.npy", others))
-    assert (found["compared"], found["only_in_a"], found["only_in_b"]) == (49, 7, 7)
-
-
-def test_compare_refuses(pair, tmp_path):
-    levelset, a, b = pair
-    before = contents(tmp_path)
-    assert "--levelset" in refused("compare", a, b, "--within", "1")
-    assert "above 0" in refused("compare", a, b, "--levelset", levelset, "--within", "0")
-    assert "above 0" in refused("compare", a, b, "--period", "0")
-    assert "no such file" in refused("compare", a, tmp_path / "nothing.nii.gz")
-    assert "no zero level" in refused("compare", a, b, "--levelset", a, code=1)
-    assert contents(tmp_path) == before
-    narrow = nifti(tmp_path / "narrow.nii.gz", noisy((15, 16, 16)))
-    run = beltrami("compare", a, narrow)
-    assert (run.code, len(run.err.splitlines())) == (2, 3)
-    assert "grids differ" in refused("compare", a, b, "--levelset", narrow)
-    nothing = nifti(tmp_path / "nan.nii.gz", np.full((16, 16, 16), np.nan, np.float32))
-    assert "nothing to compare" in refused("compare", a, nothing, code=1)
+def pair(tmp_path: Path) -> tuple[Path, Path]:
+    """A level set and a volume of noise."""
+    return nifti(tmp_path / "psi.nii.gz", ball()), nifti(tmp_path / "a.nii.gz", noisy())
 
 
 def test_info(pair, tmp_path):
-    levelset, a, _ = pair
+    levelset, a = pair
     affine = np.diag([-0.8, 1.0, 1.5, 1.0])
     affine[:3, 3] = 10, -20, 30
     holes = noisy((6, 7, 8))
@@ -153,7 +44,7 @@ def test_info_tells_labels(tmp_path):
 
 
 def test_info_goes_on_after_a_bad_file(pair, tmp_path):
-    levelset, a, _ = pair
+    levelset, a = pair
     run = beltrami("info", levelset, tmp_path / "nothing.nii", a)
     assert run.code == 2
     assert "no such file" in run.message
@@ -164,28 +55,6 @@ def test_info_goes_on_after_a_bad_file(pair, tmp_path):
 
 
 # --- several channels, complex numbers ---------------------------------------------------------------------------
-
-
-def test_channels_are_compared_value_by_value(tmp_path):
-    data = np.stack([noisy(), 2 * noisy(), 3 * noisy()], -1)
-    shifted = data.copy()
-    shifted[..., 1] += np.float32(2)
-    shifted[0, 0, 0, 2] = np.nan
-    a, b = nifti(tmp_path / "a.nii.gz", data), nifti(tmp_path / "b.nii.gz", shifted)
-    found = figures(a, b)
-    assert (found["compared"], found["only_in_a"]) == (data.size - 1, 1)
-    assert found["rms"] == pytest.approx(2 / np.sqrt(3), rel=1e-3)
-    near = figures(a, b, "--levelset", nifti(tmp_path / "psi.nii.gz", ball()), "--within", "1")
-    assert near["compared"] == 3 * (np.abs(ball()) <= 1).sum()
-    assert "shapes differ" in refused("compare", a, nifti(tmp_path / "one.nii.gz", noisy()))
-
-
-def test_complex_numbers_are_compared_by_their_parts(tmp_path):
-    waves = (noisy() + 1j).astype(np.complex64)
-    a, b = npy(tmp_path / "a.npy", waves), npy(tmp_path / "b.npy", waves + 3j)
-    found = figures(a, b)
-    assert found["compared"] == 2 * waves.size
-    assert (found["max_abs"], found["mean"]) == (pytest.approx(3), pytest.approx(1.5))
 
 
 def test_info_tells_channels_and_complex_numbers(tmp_path):
@@ -290,11 +159,6 @@ def test_info_on_vertex_data(tmp_path):
     assert len(done("info", series).out.splitlines()) == 16
     some = gifti(tmp_path / "p.func.gii", (np.array([3, 17], np.int32), "NODE_INDEX"), (values[:2], "SHAPE"))
     assert "range 0 to 1, median 0.5, 16 NaN" in done("info", some).out
-
-
-def test_compare_tells_vertex_data(tmp_path):
-    metric = gifti(tmp_path / "m.func.gii", (np.zeros(25, np.float32), "SHAPE"))
-    assert "m.func.gii: holds values at vertices; expected a volume" in refused("compare", metric, metric)
 
 
 def test_info_goes_on_after_a_bad_surface(tmp_path):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from beltrami_cli.errors import DataError, RefusedError
-from beltrami_cli.metrics import difference, wrapped
+from beltrami_cli.metrics import Tolerances, difference, distance_between, wrapped
+from beltrami_cli.surface import Mesh
 
 RNG = np.random.default_rng(5)
 A = RNG.normal(100, 20, (6, 5, 4))
@@ -29,7 +30,7 @@ def test_equal_arrays_have_infinite_psnr_and_null_in_json():
     assert (d.max_abs, d.rms, d.mean, d.psnr) == (0, 0, 0, math.inf)
     assert d.correlation == pytest.approx(1)
     assert json.loads(json.dumps(d.as_dict(), allow_nan=False))["psnr"] is None
-    assert d.exceeds(max_abs=0, max_rms=0, min_psnr=100) == []
+    assert d.exceeds(Tolerances(max_abs=0, max_rms=0, min_psnr=100, max_missing=0)) == []
 
 
 def test_missing_values_are_counted_not_compared():
@@ -72,21 +73,70 @@ def test_angles_all_around_the_circle_correlate_with_themselves():
 def test_constant_data_have_no_correlation():
     d = difference(np.full(5, 2.0), np.arange(5.0))
     assert math.isnan(d.correlation) and d.as_dict()["correlation"] is None
-    assert d.psnr == -math.inf and d.exceeds(min_psnr=0) != []
+    assert d.psnr == -math.inf and d.exceeds(Tolerances(min_psnr=0)) != []
     assert math.isnan(difference(np.full(5, 2.0), np.full(5, 3.0), period=360).correlation)
 
 
 def test_each_broken_tolerance_has_its_line():
     d = difference(A, A + 2, data_range=200)
     assert d.psnr == pytest.approx(40)
-    assert d.exceeds() == [] and d.exceeds(max_abs=2.001, max_rms=2.001, min_psnr=39.9) == []
-    lines = d.exceeds(max_abs=1.5, max_rms=1, min_psnr=45)
+    assert d.exceeds(Tolerances()) == [] and d.exceeds(Tolerances(max_abs=2.001, max_rms=2.001, min_psnr=39.9)) == []
+    lines = d.exceeds(Tolerances(max_abs=1.5, max_rms=1, min_psnr=45))
     assert lines == ["largest difference 2 is over 1.5", "rms difference 2 is over 1", "PSNR 40.00 dB is under 45 dB"]
+
+
+def test_values_in_one_of_both_are_judged_together():
+    a, b = A.copy(), A.copy()
+    a[0, 0, :2], b[1, :3, 0] = np.nan, np.inf
+    d = difference(a, b)
+    assert d.exceeds(Tolerances(max_missing=5)) == []
+    assert d.exceeds(Tolerances(max_missing=4)) == ["5 values are in only one (3 in A, 2 in B), over 4"]
+
+
+@pytest.mark.parametrize(
+    "limits", [{"max_abs": -1}, {"max_rms": math.nan}, {"max_missing": -1}, {"min_psnr": math.nan}]
+)
+def test_tolerances_that_mean_nothing_are_refused(limits):
+    with pytest.raises(RefusedError, match="tolerance m"):
+        Tolerances(**limits)
+    assert not Tolerances().are_given and not Tolerances(max_distance=0).are_of_values
+
+
+TRIANGLES = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
+
+
+def test_vertices_that_moved():
+    moved = SQUARE.copy()
+    moved[3] += 3, 0, 4
+    d = distance_between(Mesh(SQUARE, TRIANGLES), Mesh(moved, TRIANGLES))
+    assert (d.max_mm, d.rms_mm, d.same_triangles) == (5, 2.5, True)
+    assert d.exceeds(Tolerances()) == [] and d.exceeds(Tolerances(max_distance=5)) == []
+    assert d.exceeds(Tolerances(max_distance=4)) == ["vertices moved by up to 5 mm, over 4 mm"]
+    assert d.exceeds(Tolerances(max_rms=9)) == ["vertices moved by up to 5 mm, over 0.001 mm"]
+
+
+def test_surfaces_of_other_triangles():
+    """The other diagonal and a fifth vertex in the middle change nothing; one that sticks out does, in one way only."""
+    fan = np.array([[0, 1, 4], [1, 3, 4], [3, 2, 4], [2, 0, 4]], np.int32)
+    for height in (0.0, 0.25):
+        other = Mesh(np.vstack([SQUARE, [0.5, 0.5, height], [9, 9, 9]]), fan)  # the last is of no triangle
+        for pair in ((Mesh(SQUARE, TRIANGLES), other), (other, Mesh(SQUARE, TRIANGLES))):
+            d = distance_between(*pair)
+            assert (d.max_mm, d.rms_mm, d.same_triangles) == (height, pytest.approx(height / 3), False)
+    assert "surfaces, of other triangles, are apart by up to 0.25 mm" in d.exceeds(Tolerances(max_distance=0.2))[0]
+
+
+def test_curves():
+    lines = np.array([[0, 1], [1, 2]], np.int32)
+    bent, straight = Mesh(SQUARE[:3], lines), Mesh(SQUARE[:2], lines[:1])
+    assert distance_between(bent, Mesh(SQUARE[:3] + np.array([0, 0, 2]), lines)).rms_mm == 2
+    assert distance_between(bent, straight).max_mm == 1
 
 
 def test_integers_and_huge_values_do_not_overflow():
     assert difference(np.array([0, 255], np.uint8), np.array([255, 0], np.uint8)).max_abs == 255
-    assert difference(np.array([0.0, 1e200]), np.array([1e200, 0.0])).exceeds(max_rms=1) != []
+    assert difference(np.array([0.0, 1e200]), np.array([1e200, 0.0])).exceeds(Tolerances(max_rms=1)) != []
 
 
 @pytest.mark.parametrize("options", [{"period": 0}, {"period": -1}, {"data_range": float("nan")}, {"data_range": 0}])

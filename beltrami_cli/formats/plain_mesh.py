@@ -7,12 +7,20 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from beltrami_cli.errors import DataError
 from beltrami_cli.formats import checks, colours
 from beltrami_cli.formats.frames import StoredSurface
 from beltrami_cli.surface import Mesh
+
+# What PLY files hold at vertices that are no values: places, normals, colours, places in a texture.
+_NO_VALUES = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "s", "t", "u", "v"} | {
+    "texture_u",
+    "texture_v",
+}
 
 
 def read_surface(path: Path, kind: str) -> StoredSurface:
@@ -29,6 +37,64 @@ def read_surface(path: Path, kind: str) -> StoredSurface:
             case _:
                 vertices, cells = _read_with_trimesh(path, kind)
     return StoredSurface(vertices, cells)
+
+
+def read_values(path: Path) -> dict[str, np.ndarray]:
+    """(V,) numbers at the vertices of a .ply or .vtk file by name, as stored; none of a file of another kind.
+
+    Raises DataError as `checks`, and where there are not as many as vertices.
+    """
+    match path.suffix.lower():
+        case ".ply":
+            with checks.reading(path, "PLY"):
+                columns = _read_ply(path).get("vertex", {})
+            values = {name: column for name, column in columns.items() if name.lower() not in _NO_VALUES}
+            vertices = len(columns.get("x", ()))
+        case ".vtk":
+            with checks.reading(path, "VTK"):
+                content = _load_vtk(path)
+                arrays = {name: np.asarray(array) for name, array in content.point_data.items()}
+            values = {name: array.reshape(-1) for name, array in arrays.items() if array.shape[1:] in ((), (1,))}
+            vertices = len(content.points)
+        case _:
+            return {}
+    for name, column in values.items():
+        if len(column) != vertices or column.dtype.kind not in "fiub":
+            raise DataError(
+                f"{path}: {name} is {len(column)} of type {column.dtype} for {vertices} vertices; expected a number "
+                "for each vertex: export the mesh again"
+            )
+    return values
+
+
+def read_curve(path: Path) -> Mesh | None:
+    """The curve of a .ply or .vtk file that has lines and no triangles, as `write_ply` and `write_vtk` make it.
+
+    None for any other file. Raises DataError as `checks`, and for lines between vertices that are not there or lie
+    at no finite place.
+    """
+    match path.suffix.lower():
+        case ".ply":
+            with checks.reading(path, "PLY"):
+                found = _read_ply(path)
+                if "face" in found or "edge" not in found:
+                    return None
+                vertices = np.stack([found["vertex"][axis] for axis in "xyz"], -1).astype(float)
+                lines = np.stack([found["edge"][end] for end in ("vertex1", "vertex2")], -1).astype(np.int32)
+        case ".vtk":
+            with checks.reading(path, "VTK"):
+                content = _load_vtk(path)
+                if set(content.cells_dict) != {"line"}:
+                    return None
+                vertices, lines = np.array(content.points, float), content.cells_dict["line"].astype(np.int32)
+        case _:
+            return None
+    if not ((lines >= 0) & (lines < len(vertices))).all() or not np.isfinite(vertices).all():
+        raise DataError(
+            f"{path}: a curve whose lines name vertices that are not there or lie at no finite place; expected a "
+            "complete curve: export it again"
+        )
+    return Mesh(vertices, lines)
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
@@ -90,10 +156,30 @@ def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(mesh.vertices, float), np.array(cells, np.int32)
 
 
-def _read_vtk(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_ply(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """(N,) columns of each kind of element that is there, as `vertex` and `edge`, by the name of the property."""
+    import trimesh
+
+    raw = trimesh.load(path, file_type="ply", process=False).metadata["_ply_raw"]
+    return {
+        kind: {
+            name: np.asarray(element["data"][name]).reshape(-1)
+            for name, dtype in element["properties"].items()
+            if "$LIST" not in dtype and kind != "face"
+        }
+        for kind, element in raw.items()
+        if element["length"]
+    }
+
+
+def _load_vtk(path: Path) -> Any:
     import meshio
 
-    content = meshio.vtk.read(path)  # not meshio.read, which prints and exits on what it does not know
+    return meshio.vtk.read(path)  # not meshio.read, which prints and exits on what it does not know
+
+
+def _read_vtk(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    content = _load_vtk(path)
     quads = content.cells_dict.get("quad", np.empty((0, 4)))
     triangles = content.cells_dict.get("triangle", np.empty((0, 3)))
     return np.array(content.points, float), np.concatenate([triangles, quads[:, :3], quads[:, [0, 2, 3]]]).astype(
