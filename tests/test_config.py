@@ -90,7 +90,7 @@ def test_auto_beta():
     "given",
     [
         *["", "x", "1:", ":1", "1:2:3", "1:2:linear:2", "1;2", ",", "-1", "nan", "inf", "1,-2", "0:1:geometric"],
-        *[None, True, object(), [], ["x"], [1, False]],
+        *[None, True, object, [], ["x"], [1, False]],
         *[{}, {"start": 1}, {"start": True, "stop": 2}, {"start": 1, "stop": 2, "step": 1}],
     ],
     ids=str,
