@@ -19,6 +19,7 @@ from beltrami_cli.grid import Canonical, Volume, require_same_grid, with_channel
 from beltrami_cli.inputs import Warnings, band_of, require_usable, without
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.levelset import two_values
+from beltrami_cli.memory import needed, require_within
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import sha256, sidecar, sources_of, write_record
 from beltrami_cli.resample import resample
@@ -40,6 +41,8 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
     with phases("read"):
         scene = survey(job)
     files = Files(job, scene)
+    if job.memory is not None:
+        require_within(needed(job, scene), job.memory)
     sources = sources_of(job)
     inputs = [path for path, _ in sources]
     with formats.Stage(files.all, overwrite=job.overwrite, inputs=inputs) as stage:

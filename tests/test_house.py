@@ -13,7 +13,19 @@ import beltrami_cli
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-HEAVY = {"SimpleITK", "distributed", "igl", "matplotlib", "meshio", "nibabel", "numba", "scipy", "skimage", "tqdm", "trimesh"}
+HEAVY = {
+    "SimpleITK",
+    "distributed",
+    "igl",
+    "matplotlib",
+    "meshio",
+    "nibabel",
+    "numba",
+    "scipy",
+    "skimage",
+    "tqdm",
+    "trimesh",
+}
 
 
 def run(*arguments: str) -> str:
