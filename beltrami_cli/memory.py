@@ -61,7 +61,7 @@ def needed(job: Job, scene: Scene | None = None) -> int:
     """Bytes of resident memory that `pipeline.run(job)` is estimated to take at its peak, in a process of its own.
 
     scene: what `survey` found, where that is known already. A level-set volume is read, to tell how large its surface
-    is; the rest is told by headers and meshes. Kernels are taken as compiled: a first run, which compiles them, may take
+    is; the rest is told by headers and meshes. Kernels are taken as compiled: a first run, which compiles, may take
     0.27 GB more. Raises as `survey`, and DataError where LEVELSET cannot be read or has no zero level.
     """
     scene = survey(job) if scene is None else scene

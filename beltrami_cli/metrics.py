@@ -215,5 +215,6 @@ def _circular_correlation(x: np.ndarray, y: np.ndarray, period: float) -> float:
 
 
 def _normalised_product(p: np.ndarray, q: np.ndarray) -> float:
-    size = math.sqrt(float(p @ p) * float(q @ q))
-    return float(p @ q) / size if size > 0 else math.nan
+    # Sums, not @, which BLAS adds up in an order of its threads.
+    size = math.sqrt(float((p * p).sum()) * float((q * q).sum()))
+    return float((p * q).sum()) / size if size > 0 else math.nan

@@ -261,7 +261,7 @@ def forget_peak_memory() -> None:
 
 
 def _peak_memory_mib() -> float | None:
-    """Largest resident set of this process so far, or since `forget_peak_memory`; None where the system does not say (Windows)."""
+    """Largest resident set of this process, so far or since `forget_peak_memory`; None where unknown (Windows)."""
     status = Path("/proc/self/status")
     if status.exists():  # Linux, where ru_maxrss counts the peak of the process that started this one too
         for line in status.read_text().splitlines():

@@ -179,7 +179,7 @@ class _Watch:
 
     def __call__(self, k: int, u: np.ndarray) -> str | None:
         each = self.kind.errors(self.seen(u), self.truth)
-        self.errors.append(float(self.weight @ each))
+        self.errors.append(float((self.weight * each).sum()))  # not @: BLAS sums in an order of its threads
         if k == 0:
             self.first = self.best = each
         elif self.to_end or self.errors[k] < self.errors[self.least]:

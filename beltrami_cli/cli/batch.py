@@ -108,7 +108,7 @@ def batch(
         Stage([summary], overwrite=policy.resume or policy.overwrite, inputs=configs)
     announce_compilation(quiet)
     study = _with_threads(study, threads, at_once)
-    with _executor(scheduler, at_once, study) as executor, _Progress(len(study), quiet) as progress:
+    with _executor(scheduler, at_once, study) as executor, _Progress(len(study), quiet, bool(verbose)) as progress:
         rows = run(study, executor, policy, settled=progress.settled, watch=progress.watch)
     _tell_rows(rows, quiet)
     if summary is not None:
@@ -141,8 +141,8 @@ def _executor(scheduler: str | None, at_once: int | None, study: Sequence[Planne
 class _Progress:
     """What is seen of a batch while it runs: on a terminal a bar with what runs, else a line for each job."""
 
-    def __init__(self, count: int, quiet: bool) -> None:
-        self.count, self.quiet, self.bar, self.past = count, quiet, None, 0
+    def __init__(self, count: int, quiet: bool, verbose: bool) -> None:
+        self.count, self.quiet, self.verbose, self.bar, self.past = count, quiet, verbose, None, 0
         self.on_terminal = not quiet and sys.stderr.isatty()
 
     def __enter__(self) -> _Progress:
@@ -160,12 +160,15 @@ class _Progress:
 
     def settled(self, row: Row) -> None:
         self.past += 1
-        line = f"{self.past}/{self.count} {row.job}: {_outcome(row)}"
+        lines = [f"{self.past}/{self.count} {row.job}: {_outcome(row)}"]
+        if self.verbose:
+            lines += [f"{row.job}: warning: {warning}" for warning in row.warnings]
         if self.bar is None:
-            note(self.quiet, line)
+            for line in lines:
+                note(self.quiet and row.status != "failed", line)
             return
         self.bar.update()
-        if row.status == "failed":
+        for line in lines if row.status == "failed" else lines[1:]:
             self.bar.write(f"beltrami: {line}", file=sys.stderr)
 
     def watch(self, running: list[Running]) -> None:
@@ -208,7 +211,7 @@ def _tell_rows(rows: Sequence[Row], quiet: bool) -> None:
     counts = Counter(row.status for row in rows)
     warned = sum(bool(row.warnings) for row in rows)
     told = ", ".join(f"{number} {status}" for status, number in sorted(counts.items()))
-    say(quiet, f"{len(rows)} jobs: {told}" + (f"; {warned} with warnings, see their records" if warned else ""))
+    say(quiet, f"{len(rows)} jobs: {told}" + (f"; {warned} with warnings, see their records (-v)" if warned else ""))
 
 
 def _tell_table(cells: Sequence[tuple[str, ...]], quiet: bool) -> None:
