@@ -9,19 +9,20 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Literal
 
-from beltrami_cli import __version__, executors, formats
+from beltrami_cli import __version__, cluster, formats
 from beltrami_cli.config import Job
 from beltrami_cli.errors import BeltramiError, BusyError, RefusedError
-from beltrami_cli.memory import needed, told
+from beltrami_cli.executors import Workers, alone, deaths
+from beltrami_cli.memory import needed, require_within
 from beltrami_cli.record import forget_peak_memory, sidecar_of
-from beltrami_cli.resume import finished
+from beltrami_cli.resume import finished, outputs_of
 from beltrami_cli.study import Planned
 
 Status = Literal["done", "skipped", "failed", "busy"]
@@ -61,7 +62,6 @@ class Policy:
     resume: jobs that are done already are skipped, others replace what is there. overwrite: all replace what is there.
     retries: how often a job is started anew whose process died. memory: bytes that all jobs at once may be estimated
     to need; None for as much as `spare`, where a job that is alone may need more. spare: bytes that are free.
-    at_once: jobs; None for as many as there are, where the executor has a queue and limits of its own.
     """
 
     resume: bool = False
@@ -69,7 +69,6 @@ class Policy:
     retries: int = 2
     memory: int | None = None
     spare: int | None = None
-    at_once: int | None = 1
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ class Running:
 
 def run(
     study: Sequence[Planned],
-    executor: Executor,
+    executor: Workers,
     policy: Policy,
     *,
     settled: Callable[[Row], None] = lambda row: None,
@@ -103,7 +102,7 @@ class _Batch:
     def __init__(
         self,
         study: Sequence[Planned],
-        executor: Executor,
+        executor: Workers,
         policy: Policy,
         settled: Callable[[Row], None],
         watch: Callable[[list[Running]], None],
@@ -116,6 +115,7 @@ class _Batch:
         self.since: dict[int, float] = {}
         self.taken: dict[int, int] = {}  # bytes by job
         self.tries = [0] * len(study)
+        self.started: set[int] = set()
         self.rows: list[Row | None] = [None] * len(study)
 
     def run(self) -> list[Row]:
@@ -134,7 +134,7 @@ class _Batch:
     def _start(self) -> None:
         """Start jobs while there is room for them, those that wait for another run last."""
         now = time.monotonic()
-        while not self._is_full():
+        while len(self.running) < self.executor.slots():
             if self.waiting:
                 k = self.waiting[0]
             elif self.busy and self.busy[0][0] <= now:
@@ -144,7 +144,7 @@ class _Batch:
             try:
                 if not self._has_room(k):
                     return
-                if not self.tries[k]:
+                if k not in self.started:
                     _require_free(self.study[k].job, self.policy)
             except BeltramiError as error:
                 self._pop()
@@ -170,10 +170,11 @@ class _Batch:
         policy, job = self.policy, self.study[k].job
         replaces = policy.overwrite or job.overwrite
         # A second try finds what the first one finished.
-        look = policy.resume or not replaces or self.tries[k] > 0
+        look = policy.resume or not replaces or k in self.started
         job = replace(job, overwrite=replaces or policy.resume)
-        limit = policy.memory if policy.at_once is None else None
+        limit = None if self.executor.one_machine else policy.memory
         self.tries[k] += 1
+        self.started.add(k)
         self.since[k] = time.monotonic()
         try:
             future = self.executor.submit(perform, replace(self.study[k], job=job), look, limit, __version__)
@@ -183,21 +184,14 @@ class _Batch:
         self.running[future] = k
         future.add_done_callback(self.done.put)
 
-    def _is_full(self) -> bool:
-        most = self.policy.at_once
-        if isinstance(self.executor, executors.Cluster):
-            # One for each worker: where one dies, Dask blames all the jobs that wait there too.
-            most = self.executor.workers()
-        return most is not None and len(self.running) >= most
-
     def _has_room(self, k: int) -> bool:
         """True where the job fits beside those that run; raises RefusedError where it never will, and as `needed`."""
-        if self.policy.at_once is None:
+        if not self.executor.one_machine:
             return True  # every worker looks for itself
         if k not in self.taken:
             self.taken[k] = needed(self.study[k].job)
         if self.policy.memory is not None:
-            _require_memory(self.taken[k], self.policy.memory)
+            require_within(self.taken[k], self.policy.memory)
         limit = self.policy.memory if self.policy.memory is not None else self.policy.spare
         others = sum(self.taken[other] for other in self.running.values())
         return not self.running or limit is None or others + self.taken[k] <= limit
@@ -207,16 +201,17 @@ class _Batch:
         k = self.running.pop(future)
         error = CancelledError("the connection was lost") if future.cancelled() else future.exception()
         if error is not None:
-            lost = executors.deaths(error)
+            lost = deaths(error)
             self.tries[k] += max(lost - 1, 0)
             if lost and self.tries[k] <= self.policy.retries:
                 self.waiting.append(k)
             else:
-                reason = _lost(self.tries[k], error) if lost else _odd(error)
+                reason = _lost(self.tries[k], error) if lost else _not_understood(error)
                 self._settle(k, Row(*self._names(k), "failed", reason=reason))
             return
         row = future.result()
-        if row.status == "busy" and self.policy.resume:
+        # A worker that is told to end does so after its job, which Dask has given to another meanwhile.
+        if row.status == "busy" and (self.policy.resume or not self.executor.one_machine):
             self.tries[k] -= 1
             self.busy.append((time.monotonic() + _TRY_AGAIN, k))
         elif row.status == "busy":
@@ -251,7 +246,7 @@ def foresee(planned: Planned, policy: Policy) -> Plan:
         size = needed(planned.job)
         _require_free(planned.job, policy)
         if policy.memory is not None:
-            _require_memory(size, policy.memory)
+            require_within(size, policy.memory)
     except BeltramiError as error:
         return Plan("fail", str(error))
     return Plan("run", "", size)
@@ -266,18 +261,18 @@ def perform(planned: Planned, look: bool, limit: int | None, version: str) -> Ro
     names = _names(planned)
     warnings: list[str] = []
     try:
-        with executors.alone:
+        with alone:
             if version != __version__:
                 raise RefusedError(f"worker: has beltrami_cli {__version__}; expected {version}: install the same")
             record, status = _record_of(planned.job, look, limit, warnings)
     except BusyError as error:
         return Row(*names, "busy", reason=str(error))
     except BeltramiError as error:
-        return Row(*names, "failed", warnings=tuple(warnings), reason=str(error))
+        return Row(*names, "failed", warnings=tuple(warnings), reason=cluster.own_place() + str(error))
     except MemoryError:
         return Row(*names, "failed", warnings=tuple(warnings), reason="out of memory; use a smaller band, or --jobs")
     except Exception as error:
-        reason = f"unexpected {type(error).__name__}: {' '.join(str(error).split()) or 'no message'} (please report it)"
+        reason = f"unexpected {type(error).__name__}: {_line(error)} (please report it)"
         return Row(*names, "failed", warnings=tuple(warnings), reason=reason)
     return Row(*names, status, **_figures(record))
 
@@ -288,16 +283,18 @@ def _record_of(job: Job, look: bool, limit: int | None, warnings: list[str]) -> 
 
     record = finished(job) if look else None
     if record is not None:
-        formats.Stage(map(Path, record["Outputs"]), overwrite=True).sweep()
+        with suppress(RefusedError):  # of a study that is done and locked nothing can be removed
+            formats.Stage(outputs_of(record, sidecar_of(job.volume)), overwrite=True).sweep()
         return record, "skipped"
-    limits = [size for size in (limit, executors.own_memory()) if size is not None]
+    limits = [size for size in (limit, cluster.own_memory()) if size is not None]
     if limits:
-        _require_memory(needed(job), min(limits))
+        require_within(needed(job), min(limits))
     if job.settings.threads is None:
-        job = replace(job, settings=replace(job.settings, threads=executors.own_threads()))
+        job = replace(job, settings=replace(job.settings, threads=cluster.own_threads()))
     _make_folders(job)
     forget_peak_memory()
-    return pipeline.run(job, notify=warnings.append).record, "done"
+    unless = (lambda: finished(job)) if look else (lambda: None)
+    return pipeline.run(job, notify=warnings.append, unless=unless).record, "done"
 
 
 def _make_folders(job: Job) -> None:
@@ -320,14 +317,6 @@ def _require_free(job: Job, policy: Policy) -> None:
     for final in (job.volume, sidecar_of(job.volume)):
         if final.exists() and formats.who_writes(sidecar_of(job.volume)) is None:
             raise RefusedError(f"{final}: exists already; --resume skips what is done, --overwrite replaces it")
-
-
-def _require_memory(size: int, limit: int) -> None:
-    if size > limit:
-        raise RefusedError(
-            f"memory: needs about {told(size)}; found a limit of {told(limit)}: give more (--memory), or crop the "
-            "volumes to the surface"
-        )
 
 
 def _names(planned: Planned) -> tuple[str, str, str]:
@@ -353,12 +342,24 @@ def _mean(per_channel: Iterable[float | None] | None) -> float | None:
     return math.sqrt(sum(sd * sd for sd in known) / len(known)) if known else None
 
 
-def _lost(tries: int, error: BaseException | None) -> str:
-    why = "the connection was lost" if error is None else " ".join(str(error).split()) or type(error).__name__
+def _not_understood(error: BaseException) -> str:
     return (
-        f"its process died, {tries} {'time' if tries == 1 else 'times'} of {tries} ({why}): out of memory, or killed? "
-        "Give it more memory, or run fewer jobs at once"
+        f"worker: cannot take the job ({type(error).__name__}: {_line(error)}); expected the same Python, beltrami_cli "
+        "and Dask there, at the scheduler and here"
     )
+
+
+def _lost(tries: int, error: BaseException) -> str:
+    times = "once" if tries == 1 else f"{tries} times of {tries}"
+    last = getattr(error, "last_worker", None)  # of Dask's KilledWorker, whose own text is a paragraph
+    why = _line(error) if last is None else f"the last time on worker {last.address}, see its log"
+    return (
+        f"its process died, {times} ({why}): out of memory, or killed? Give it more memory, or run fewer jobs at once"
+    )
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def write_summary(path: Path, rows: Sequence[Row]) -> None:

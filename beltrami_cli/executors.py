@@ -1,4 +1,4 @@
-"""Where jobs run: processes of this machine or workers of a Dask cluster, both as `concurrent.futures.Executor`.
+"""Where jobs run, as `concurrent.futures.Executor`: here processes of this machine, in `cluster` Dask's workers.
 
 Either way a process does one job at a time, with a known number of threads: numba's default threading layer ends a
 process in which two Python threads enter parallel kernels.
@@ -11,25 +11,39 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path
+from multiprocessing import resource_tracker
 from queue import SimpleQueue
 from typing import Any
 
-from beltrami_cli.errors import RefusedError
-
 # How many threads a library starts, read when it is loaded: numba, libigl, and what stands behind NumPy and SciPy.
 _THREADS = ("NUMBA_NUM_THREADS", "IGL_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# Seconds to wait for a scheduler to answer: it does so at once, or its address is wrong.
-_ANSWER = 10
+# Seconds in which a worker whose batch is gone leaves compiled code, where signals wait.
+_LAST_CALL = 2
+# Signals that end a worker.
+_ENDING = (signal.SIGINT, signal.SIGTERM)
 
 # Held by the job that this process does: a Dask worker of several threads would start several.
 alone = threading.Lock()
 
 
-class Processes(Executor):
+class Workers(Executor):
+    """An executor whose workers do one job at a time each.
+
+    one_machine: whether its jobs share the memory of this machine.
+    """
+
+    one_machine = True
+
+    def slots(self) -> int:
+        """How many jobs can run at once now."""
+        return 1
+
+
+class Processes(Workers):
     """So many processes of this machine, started when first needed; each does one job at a time.
 
     Each is a pool of its own: where one is killed its job alone ends, with BrokenProcessPool, and another takes its
@@ -37,15 +51,22 @@ class Processes(Executor):
     """
 
     def __init__(self, count: int, threads: int) -> None:
-        self._threads = threads
+        self._count, self._threads = count, threads
+        if os.name == "posix":
+            # It clears up behind this process where that is stopped at once, and would print warnings that it had to.
+            with _environment({"PYTHONWARNINGS": "ignore:resource_tracker"}):
+                resource_tracker.ensure_running()
         self._idle: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
         for _ in range(count):
             self._idle.put(self._fresh())
 
+    def slots(self) -> int:
+        return self._count
+
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """As Executor.submit; waits while every process is at work."""
         pool = self._idle.get()
-        with _environment({name: str(self._threads) for name in _THREADS}):
+        with _environment({name: str(self._threads) for name in _THREADS}), _signals_held():
             try:
                 future = pool.submit(fn, *args, **kwargs)
             except BrokenExecutor:  # killed while it was idle
@@ -63,59 +84,20 @@ class Processes(Executor):
         return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_become_worker)
 
 
-@contextmanager
-def cluster(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler, by its address or the .json file that it wrote.
-
-    Raises RefusedError where Dask is not installed or no scheduler answers.
-    """
-    try:
-        from distributed import Client
-    except ImportError:
-        raise RefusedError(
-            "scheduler: needs Dask, which is not installed; install it: pip install 'beltrami_cli[cluster]'"
-        ) from None
-    where = {"scheduler_file": address} if address.endswith(".json") else {"address": address}
-    if "scheduler_file" in where and not Path(address).is_file():
-        raise RefusedError(f"scheduler: {address}: no such file; expected the one that dask-scheduler wrote")
-    try:
-        client = Client(**where, timeout=_ANSWER, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise RefusedError(
-            f"scheduler: {address}: none answers there ({reason}); expected an address as tcp://HOST:8786"
-        ) from None
-    with client, client.get_executor(pure=False) as executor:
-        yield executor
-
-
-def own_threads() -> int | None:
-    """Threads that this process may use for a job, as a Dask worker's; None where nothing says so."""
-    worker = _dask_worker()
-    return None if worker is None else int(worker.state.nthreads)
-
-
-def own_memory() -> int | None:
-    """Bytes that a Dask worker in this process may take; None where there is none, or no limit."""
-    worker = _dask_worker()
-    return None if worker is None else worker.memory_manager.memory_limit
-
-
-def _dask_worker() -> Any:
-    if "distributed" not in sys.modules:
-        return None
-    from distributed import get_worker
-
-    try:
-        return get_worker()
-    except ValueError:  # not in a worker
-        return None
+def deaths(error: BaseException) -> int:
+    """How many processes were lost at a job that ended with this error; 0 where the error is one of its own."""
+    if isinstance(error, BrokenExecutor | CancelledError):
+        return 1
+    # Dask's KilledWorker: its scheduler starts a job again where a worker died, so many times, before it gives up.
+    return 1 + error.allowed_failures if hasattr(error, "allowed_failures") else 0
 
 
 def _become_worker() -> None:
     """End with the process that started this one: on its signals, and when it is gone."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: _end())
+    for number in _ENDING:
+        signal.signal(number, _end_on_signal)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -123,7 +105,17 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
+        if hasattr(signal, "pthread_kill"):
+            # From the main thread, if it can be had: it would go on writing beside this one, whose locks are given up.
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+            time.sleep(_LAST_CALL)
         _end()
+
+
+def _end_on_signal(*_: Any) -> None:
+    for number in _ENDING:  # another one would come between two steps of this one's end
+        signal.signal(number, signal.SIG_IGN)
+    _end()
 
 
 def _end() -> None:
@@ -135,6 +127,19 @@ def _end() -> None:
 
 def _is_broken(done: Future[Any]) -> bool:
     return not done.cancelled() and isinstance(done.exception(), BrokenExecutor)
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """Signals that end a process wait; in one that is started meanwhile until it is a worker, which ends in silence."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 
 from beltrami_cli import formats, kernels
 from beltrami_cli.config import Job, Settings
-from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.errors import BusyError, DataError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import own_samples
 from beltrami_cli.grid import Canonical, Volume, require_same_grid, with_channels
@@ -30,11 +30,18 @@ from beltrami_cli.surface import Mesh
 from beltrami_cli.survey import REMEDY, Files, Scene, is_plane, pass_on, read, spacing_for, survey
 
 
-def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], None] | None = None) -> Result:
+def run(
+    job: Job,
+    *,
+    observer: Observer | None = None,
+    notify: Callable[[str], None] | None = None,
+    unless: Callable[[], object] = lambda: None,
+) -> Result:
     """Denoise files: read, check, denoise, write OUT, mesh and sidecar. Nothing is written unless everything is.
 
-    notify: called with each warning as soon as it is known. Raises as `denoise`, and RefusedError, from
-    the headers alone, where an output exists or cannot be written, or the grids differ. Frames of volumes that run
+    notify: called with each warning as soon as it is known. unless: asked once no other run can write the outputs;
+    where it says yes, BusyError is raised, for another run has just made them. Raises as `denoise`, and RefusedError,
+    from the headers alone, where an output exists or cannot be written, or the grids differ. Frames of volumes that run
     independently stream through memory one at a time; the result then holds no data.
     """
     phases, warnings = Phases(), Warnings(notify)
@@ -46,6 +53,8 @@ def run(job: Job, *, observer: Observer | None = None, notify: Callable[[str], N
     sources = sources_of(job)
     inputs = [path for path, _ in sources]
     with formats.Stage(files.all, overwrite=job.overwrite, inputs=inputs) as stage:
+        if unless():
+            raise BusyError(f"{job.volume}: another run has just written it; nothing was done")
         phases.tell = stage.tell
         with phases("numba"):
             kernels.wake()

@@ -27,7 +27,7 @@ def finished(job: Job) -> dict[str, Any] | None:
         same = (
             record["GeneratedBy"][0]["Version"] == __version__
             and record["Request"] == json.loads(json.dumps(request(job)))
-            and all(output.is_file() for output in _outputs(record, sidecar))
+            and all(output.is_file() for output in outputs_of(record, sidecar))
             and [(source.get("Role"), source["SHA256"]) for source in record["Sources"]]
             == [(role, sha256(path)) for path, role in sources]
         )
@@ -36,7 +36,7 @@ def finished(job: Job) -> dict[str, Any] | None:
     return record if same else None
 
 
-def _outputs(record: Mapping[str, Any], sidecar: Path) -> list[Path]:
-    """Where the outputs are if the study has moved since, with its sidecars."""
+def outputs_of(record: Mapping[str, Any], sidecar: Path) -> list[Path]:
+    """Where the files are that a record tells of: beside its sidecar, if the study has moved since."""
     *_, then = record["Outputs"]
     return [sidecar.parent / os.path.relpath(output, os.path.dirname(then)) for output in record["Outputs"]]

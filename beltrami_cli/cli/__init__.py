@@ -71,6 +71,8 @@ def _run(args: list[str] | None) -> int:
 
 def _stop(number: int, _frame: Any) -> None:
     """End the process here and now: an exception that meets a compiled function on its way out can crash it."""
+    for other in STOPPED:  # a second one would come between two steps of this one's end
+        signal.signal(other, signal.SIG_IGN)
     staging = sys.modules.get("beltrami_cli.formats.staging")  # else nothing is being written
     if staging is not None:
         staging.abandon()

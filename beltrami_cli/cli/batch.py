@@ -16,9 +16,8 @@ import click
 from beltrami_cli.cli.common import Command, announce_compilation, note, overwrite_option, say
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
     from beltrami_cli.batch import Policy, Row, Running
+    from beltrami_cli.executors import Workers
     from beltrami_cli.study import Planned
 
 FILE = click.Path(path_type=Path)
@@ -99,17 +98,17 @@ def batch(
     if part is not None:
         study = studies.part(study, part)
     limit = None if memory is None else parse_memory(memory)
-    at_once = None if scheduler is not None else min(jobs or 1, max(len(study), 1))
-    policy = Policy(resume, bool(overwrite), retries, limit, available(), at_once)
+    policy = Policy(resume, bool(overwrite), retries, limit, available())
     if dry_run:
         return _tell_plan(study, policy, quiet)
     if summary is not None:
         summary_format(summary)
         Stage([summary], overwrite=policy.resume or policy.overwrite, inputs=configs)
     announce_compilation(quiet)
-    study = _with_threads(study, threads, at_once)
-    with _executor(scheduler, at_once, study) as executor, _Progress(len(study), quiet, bool(verbose)) as progress:
-        rows = run(study, executor, policy, settled=progress.settled, watch=progress.watch)
+    at_once = min(jobs or 1, max(len(study), 1))
+    study = _with_threads(study, threads, None if scheduler else at_once)
+    with _workers(scheduler, at_once, study, quiet) as workers, _Progress(len(study), quiet, bool(verbose)) as progress:
+        rows = run(study, workers, policy, settled=progress.settled, watch=progress.watch)
     _tell_rows(rows, quiet)
     if summary is not None:
         write_summary(summary, rows)
@@ -117,7 +116,10 @@ def batch(
 
 
 def _with_threads(study: Sequence[Planned], threads: int | None, at_once: int | None) -> list[Planned]:
-    """The study with threads for each job, where its config says none: of this machine's CPUs a fair share."""
+    """The study with threads for each job, where its config says none: of this machine's CPUs a fair share.
+
+    at_once: jobs; None on a cluster, where each worker knows its own.
+    """
     from beltrami_cli.solver import cpus
 
     share = threads if at_once is None else threads or max(1, cpus() // at_once)
@@ -129,13 +131,17 @@ def _with_threads(study: Sequence[Planned], threads: int | None, at_once: int | 
     ]
 
 
-def _executor(scheduler: str | None, at_once: int | None, study: Sequence[Planned]) -> AbstractContextManager[Executor]:
-    from beltrami_cli.executors import Processes, cluster
-
+def _workers(
+    scheduler: str | None, at_once: int, study: Sequence[Planned], quiet: bool
+) -> AbstractContextManager[Workers]:
     if scheduler is not None:
-        return cluster(scheduler)
+        from beltrami_cli.cluster import cluster
+
+        return cluster(scheduler, lambda line: note(quiet, line))
+    from beltrami_cli.executors import Processes
+
     most = max((planned.job.settings.threads or 1 for planned in study), default=1)
-    return Processes(at_once or 1, most)
+    return Processes(at_once, most)
 
 
 class _Progress:

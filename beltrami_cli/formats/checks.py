@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
+import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +16,8 @@ from numpy.typing import DTypeLike
 
 from beltrami_cli.errors import BeltramiError, DataError, RefusedError
 
+# Bytes that a file system gives at a time: a disk with less is full.
+_A_PAGE = 4096
 # Vertices per hemisphere of the usual cortical meshes, whose data is often stored in volume files.
 _SURFACE_SIZES = {642, 2562, 10242, 40962, 163842, 32492, 59292}
 
@@ -43,6 +47,8 @@ def writing(path: Path) -> Iterator[None]:
             raise
         except Exception as error:
             reason = _reason(error, "the folder or the disk refuses it")
+            if _is_full(path.parent):  # which not every library says
+                reason = os.strerror(errno.ENOSPC)
             raise DataError(f"{path.name}: cannot be written ({reason}); check the disk and its quota") from error
 
 
@@ -176,6 +182,13 @@ def _quietly() -> Iterator[None]:
             yield
     finally:
         log.disabled = was_disabled
+
+
+def _is_full(folder: Path) -> bool:
+    try:
+        return shutil.disk_usage(folder).free < _A_PAGE
+    except OSError:
+        return False
 
 
 def _reason(error: Exception, otherwise: str) -> str:

@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import socket
+import warnings
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -163,7 +164,9 @@ def _claim(folder: Path, final: Path) -> None:
         try:
             folder.mkdir(exist_ok=True)
             lock = FileLock(folder / _LOCK, timeout=_PATIENCE, thread_local=False)
-            lock.acquire()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that a file system without locks gets a file in their place
+                lock.acquire()
         except (FileNotFoundError, FileExistsError):  # its last owner removed the folder just now
             if folder.parent.is_dir() and not folder.is_file():
                 continue
@@ -188,8 +191,8 @@ def _claim(folder: Path, final: Path) -> None:
 
 def _give_up(folder: Path) -> None:
     """Remove a hidden folder whose lock this process holds, the lock last."""
-    lock = _OPEN.pop(folder)
     _empty(folder)
+    lock = _OPEN.pop(folder)  # not before: `abandon` may come in between
     with suppress(OSError):  # where an open file cannot be removed, the next run takes the folder over
         (folder / _LOCK).unlink()
     lock.release()
