@@ -588,7 +588,7 @@ def test_interrupted_in_mid_run_leaves_nothing(scene, tmp_path, number, code):
     command = [sys.executable, "-m", "beltrami_cli", "denoise", levelset, data, "-o", out, "--iterations", "10000000"]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not (tmp_path / ".out.nii.gz.partial").exists():
+    while not (tmp_path / ".out.json.partial").exists():
         assert run.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.02)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beltrami_cli.cli.common import Command, announce_compilation, note, overwrite_option, say
+from beltrami_cli.cli.common import Command, announce_compilation, note, overwrite_option, say, short
 
 if TYPE_CHECKING:
     from beltrami_cli.batch import Policy, Row, Running
@@ -187,7 +186,7 @@ class _Progress:
 
 def _outcome(row: Row) -> str:
     seconds = "" if row.seconds is None else f", {row.seconds:.1f} s"
-    return f"{row.status}{seconds}" if row.status != "failed" else f"failed: {_short(row.reason)}"
+    return f"{row.status}{seconds}" if row.status != "failed" else f"failed: {short(row.reason)}"
 
 
 def _tell_plan(study: Sequence[Planned], policy: Policy, quiet: bool) -> int:
@@ -199,7 +198,7 @@ def _tell_plan(study: Sequence[Planned], policy: Policy, quiet: bool) -> int:
     cells = [("job", "plan", "memory", "output", "")]
     for planned, plan in zip(study, plans, strict=True):
         memory = "" if plan.memory is None else told(plan.memory)
-        cells.append((planned.name, plan.what, memory, _short(str(planned.job.volume)), _short(plan.reason)))
+        cells.append((planned.name, plan.what, memory, short(str(planned.job.volume)), short(plan.reason)))
     _tell_table(cells, quiet)
     counts = Counter(plan.what for plan in plans)
     say(quiet, f"{len(study)} jobs: " + ", ".join(f"{number} to {what}" for what, number in counts.items()))
@@ -212,7 +211,7 @@ def _tell_rows(rows: Sequence[Row], quiet: bool) -> None:
     for row in rows:
         seconds = "" if row.seconds is None else f"{row.seconds:.1f}"
         noise = tuple("" if sd is None else f"{sd:.4g}" for sd in (row.noise_before, row.noise_after))
-        cells.append((row.job, row.status, seconds, *noise, row.stop_reason or "", _short(row.reason)))
+        cells.append((row.job, row.status, seconds, *noise, row.stop_reason or "", short(row.reason)))
     _tell_table(cells, quiet)
     counts = Counter(row.status for row in rows)
     warned = sum(bool(row.warnings) for row in rows)
@@ -225,8 +224,3 @@ def _tell_table(cells: Sequence[tuple[str, ...]], quiet: bool) -> None:
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for row in cells:
         say(quiet, "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-
-
-def _short(text: str) -> str:
-    """Paths in the working folder as seen from there."""
-    return text.replace(os.getcwd() + os.sep, "")

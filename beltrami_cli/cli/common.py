@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import traceback
 from typing import Any
 
@@ -55,6 +56,11 @@ def note(quiet: bool, line: str) -> None:
     """A line about the run on stderr, unless quiet."""
     if not quiet:
         click.echo(f"beltrami: {line}", err=True)
+
+
+def short(text: str) -> str:
+    """Paths in the working folder as seen from there."""
+    return text.replace(os.getcwd() + os.sep, "")
 
 
 def announce_compilation(quiet: bool) -> None:

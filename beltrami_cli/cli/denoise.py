@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from beltrami_cli.cli.common import Command, announce_compilation, frame_option, note, overwrite_option, say
+from beltrami_cli.cli.common import Command, announce_compilation, frame_option, note, overwrite_option, say, short
 
 FILE = click.Path(path_type=Path)
 
@@ -223,7 +223,7 @@ def summary(record: dict[str, Any]) -> list[str]:
         f"stopped by {record['StopReason']}",
         f"{sum(record['Seconds'].values()):.1f} s",
     ]
-    lines = [f"wrote {', '.join(record['Outputs'])}", ", ".join(done)]
+    lines = [f"wrote {short(', '.join(record['Outputs']))}", ", ".join(done)]
     if record.get("Choice"):
         lines.append(f"chosen by held-out data: {_combination(record['Choice'])}")
     return lines

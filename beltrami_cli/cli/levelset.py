@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from beltrami_cli.cli.common import Command, announce_compilation, frame_option, note, overwrite_option, say
+from beltrami_cli.cli.common import Command, announce_compilation, frame_option, note, overwrite_option, say, short
 
 FILE = click.Path(path_type=Path)
 
@@ -78,6 +78,6 @@ def levelset(
     )
     grid = Grid(tuple(record["Grid"]["shape"]), np.array(record["Grid"]["affine_ras_mm"]))
     inside = record["Voxels"]["inside"] / sum(record["Voxels"].values())
-    say(quiet, f"wrote {', '.join(record['Outputs'])}")
+    say(quiet, f"wrote {short(', '.join(record['Outputs']))}")
     say(quiet, f"{grid.describe()}: {inside:.1%} of the voxels inside")
     return 0

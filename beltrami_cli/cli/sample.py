@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from beltrami_cli.cli.common import Command, frame_option, note, overwrite_option, say
+from beltrami_cli.cli.common import Command, frame_option, note, overwrite_option, say, short
 
 FILE = click.Path(path_type=Path)
 
@@ -68,7 +68,7 @@ def sample(
     )
     record = volume_to_surface.sample(job, notify=lambda line: note(quiet, f"warning: {line}"))
     counts = record["Vertices"]
-    say(quiet, f"wrote {', '.join(record['Outputs'])}")
+    say(quiet, f"wrote {short(', '.join(record['Outputs']))}")
     say(
         quiet,
         f"{counts['with_value']} of {counts['vertices']} vertices have a value, "
