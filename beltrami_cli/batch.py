@@ -25,7 +25,8 @@ from beltrami_cli.record import forget_peak_memory, sidecar_of
 from beltrami_cli.resume import finished, outputs_of
 from beltrami_cli.study import Planned
 
-Status = Literal["done", "skipped", "failed", "busy"]
+# open: looked at, and not done yet. busy: another run is writing its outputs.
+Status = Literal["done", "skipped", "failed", "open", "busy"]
 
 # Seconds between two looks at what runs, for those who watch.
 _LOOK = 0.5
@@ -73,13 +74,15 @@ class Policy:
 
 @dataclass(frozen=True)
 class Running:
-    """A job that is running now, or waits for another run (`busy`). since: seconds of `time.monotonic`."""
+    """A job that is running now, or waits for another run that writes its outputs."""
 
     planned: Planned
-    since: float
+    waits: bool = False
 
     @property
     def phase(self) -> str:
+        if self.waits:
+            return "waits for another run"
         return (formats.who_writes(sidecar_of(self.planned.job.volume)) or {}).get("phase", "")
 
 
@@ -90,12 +93,14 @@ def run(
     *,
     settled: Callable[[Row], None] = lambda row: None,
     watch: Callable[[list[Running]], None] = lambda running: None,
+    notify: Callable[[str], None] = lambda line: None,
 ) -> list[Row]:
     """What became of every job of the study, in its order; no job's failure stops another.
 
     settled: called with each row once it is final. watch: called about twice a second with what is running.
+    notify: called with a line where a job has to wait for another run.
     """
-    return _Batch(study, executor, policy, settled, watch).run()
+    return _Batch(study, executor, policy, settled, watch, notify).run()
 
 
 class _Batch:
@@ -106,16 +111,19 @@ class _Batch:
         policy: Policy,
         settled: Callable[[Row], None],
         watch: Callable[[list[Running]], None],
+        notify: Callable[[str], None],
     ) -> None:
-        self.study, self.executor, self.policy, self.settled, self.watch = study, executor, policy, settled, watch
+        self.study, self.executor, self.policy = study, executor, policy
+        self.settled, self.watch, self.notify = settled, watch, notify
         self.waiting = deque(range(len(study)))
         self.busy: deque[tuple[float, int]] = deque()  # when to try again, and which job
         self.running: dict[Future[Row], int] = {}
         self.done: SimpleQueue[Future[Row]] = SimpleQueue()
-        self.since: dict[int, float] = {}
+        self.told_busy: set[int] = set()
+        self.looked: set[int] = set()  # found open
+        self.marks: dict[int, tuple[int, int] | None] = {}  # of records when jobs were first started
         self.taken: dict[int, int] = {}  # bytes by job
         self.tries = [0] * len(study)
-        self.started: set[int] = set()
         self.rows: list[Row | None] = [None] * len(study)
 
     def run(self) -> list[Row]:
@@ -128,7 +136,8 @@ class _Batch:
                 self._take(self.done.get(timeout=_LOOK))
                 while True:
                     self._take(self.done.get_nowait())
-            self.watch([Running(self.study[k], self.since[k]) for k in self.running.values()])
+            waiting = [Running(self.study[k], waits=True) for _, k in self.busy]
+            self.watch([*(Running(self.study[k]) for k in self.running.values()), *waiting])
         return [row for row in self.rows if row is not None]
 
     def _start(self) -> None:
@@ -141,17 +150,19 @@ class _Batch:
                 k = self.busy[0][1]
             else:
                 return
+            # With others' memory in mind only jobs are started that are known to be open.
+            looks = self.policy.resume and self.executor.one_machine and k not in self.looked
             try:
-                if not self._has_room(k):
+                if not looks and not self._has_room(k):
                     return
-                if k not in self.started:
+                if k not in self.marks:
                     _require_free(self.study[k].job, self.policy)
-            except BeltramiError as error:
+            except Exception as error:
                 self._pop()
-                self._settle(k, Row(*self._names(k), "failed", reason=str(error)))
+                self._settle(k, Row(*self._names(k), "failed", reason=_reason(error)))
                 continue
             self._pop()
-            self._submit(k)
+            self._submit(k, looks)
 
     def _give_up(self, reason: str) -> None:
         """Nothing more can be started."""
@@ -166,18 +177,18 @@ class _Batch:
         else:
             self.busy.popleft()
 
-    def _submit(self, k: int) -> None:
+    def _submit(self, k: int, only_look: bool) -> None:
         policy, job = self.policy, self.study[k].job
         replaces = policy.overwrite or job.overwrite
+        mark = _mark(job)
         # A second try finds what the first one finished.
-        look = policy.resume or not replaces or k in self.started
+        look = policy.resume or not replaces or mark != self.marks.setdefault(k, mark)
         job = replace(job, overwrite=replaces or policy.resume)
         limit = None if self.executor.one_machine else policy.memory
         self.tries[k] += 1
-        self.started.add(k)
-        self.since[k] = time.monotonic()
+        asked = replace(self.study[k], job=job), look, only_look, limit, __version__
         try:
-            future = self.executor.submit(perform, replace(self.study[k], job=job), look, limit, __version__)
+            future = self.executor.submit(perform, *asked)
         except Exception as error:  # the executor itself is lost
             future = Future()
             future.set_exception(error)
@@ -193,7 +204,7 @@ class _Batch:
         if self.policy.memory is not None:
             require_within(self.taken[k], self.policy.memory)
         limit = self.policy.memory if self.policy.memory is not None else self.policy.spare
-        others = sum(self.taken[other] for other in self.running.values())
+        others = sum(self.taken.get(other, 0) for other in self.running.values())
         return not self.running or limit is None or others + self.taken[k] <= limit
 
     def _take(self, future: Future[Row]) -> None:
@@ -214,6 +225,13 @@ class _Batch:
         if row.status == "busy" and (self.policy.resume or not self.executor.one_machine):
             self.tries[k] -= 1
             self.busy.append((time.monotonic() + _TRY_AGAIN, k))
+            if k not in self.told_busy:
+                self.told_busy.add(k)
+                self.notify(f"{row.job}: waits: {row.reason}")
+        elif row.status == "open":
+            self.tries[k] -= 1
+            self.looked.add(k)
+            self.waiting.appendleft(k)
         elif row.status == "busy":
             self._settle(k, replace(row, status="failed"))
         elif row.status == "skipped" and not self.policy.resume:
@@ -222,7 +240,7 @@ class _Batch:
             self._settle(k, row)
 
     def _settle(self, k: int, row: Row) -> None:
-        self.rows[k] = row = replace(row, tries=self.tries[k])
+        self.rows[k] = row = replace(row, tries=0 if row.status == "skipped" else self.tries[k])
         self.settled(row)
 
     def _names(self, k: int) -> tuple[str, str, str]:
@@ -247,16 +265,16 @@ def foresee(planned: Planned, policy: Policy) -> Plan:
         _require_free(planned.job, policy)
         if policy.memory is not None:
             require_within(size, policy.memory)
-    except BeltramiError as error:
-        return Plan("fail", str(error))
+    except Exception as error:
+        return Plan("fail", _reason(error))
     return Plan("run", "", size)
 
 
-def perform(planned: Planned, look: bool, limit: int | None, version: str) -> Row:
+def perform(planned: Planned, look: bool, only_look: bool, limit: int | None, version: str) -> Row:
     """Do a job in this process, and say what became of it; never raises.
 
-    look: skip it where it is done already. limit: bytes that it may be estimated to need. version: of the program that
-    asks; another here is refused.
+    look: skip it where it is done already. only_look: do no more; where it is not done it is "open". limit: bytes that
+    it may be estimated to need. version: of the program that asks; another here is refused.
     """
     names = _names(planned)
     warnings: list[str] = []
@@ -264,28 +282,38 @@ def perform(planned: Planned, look: bool, limit: int | None, version: str) -> Ro
         with alone:
             if version != __version__:
                 raise RefusedError(f"worker: has beltrami_cli {__version__}; expected {version}: install the same")
-            record, status = _record_of(planned.job, look, limit, warnings)
+            record = finished(planned.job) if look else None
+            if record is not None:
+                _sweep(planned.job, record)
+                return Row(*names, "skipped", **_figures(record))
+            if only_look:
+                return Row(*names, "open")
+            return Row(*names, "done", **_figures(_run(planned.job, look, limit, warnings)))
     except BusyError as error:
         return Row(*names, "busy", reason=str(error))
-    except BeltramiError as error:
-        return Row(*names, "failed", warnings=tuple(warnings), reason=cluster.own_place() + str(error))
-    except MemoryError:
-        return Row(*names, "failed", warnings=tuple(warnings), reason="out of memory; use a smaller band, or --jobs")
     except Exception as error:
-        reason = f"unexpected {type(error).__name__}: {_line(error)} (please report it)"
-        return Row(*names, "failed", warnings=tuple(warnings), reason=reason)
-    return Row(*names, status, **_figures(record))
+        return Row(*names, "failed", warnings=tuple(warnings), reason=_reason(error))
 
 
-def _record_of(job: Job, look: bool, limit: int | None, warnings: list[str]) -> tuple[dict[str, Any], Status]:
-    """The job's record, and whether it was done or skipped."""
+def _reason(error: Exception) -> str:
+    """Why a job failed, in a line."""
+    if isinstance(error, BeltramiError):
+        return cluster.own_place() + str(error)
+    if isinstance(error, MemoryError):
+        return "out of memory; use a smaller --band, crop the volumes to the surface, or run fewer jobs at once"
+    return f"unexpected {type(error).__name__}: {_line(error)} (please report it)"
+
+
+def _sweep(job: Job, record: dict[str, Any]) -> None:
+    """Remove what killed runs left of a job that is done."""
+    with suppress(RefusedError):  # of a study that is done and locked nothing can be removed
+        formats.Stage(outputs_of(record, sidecar_of(job.volume)), overwrite=True).sweep()
+
+
+def _run(job: Job, look: bool, limit: int | None, warnings: list[str]) -> dict[str, Any]:
+    """Run a job; its record."""
     from beltrami_cli import pipeline
 
-    record = finished(job) if look else None
-    if record is not None:
-        with suppress(RefusedError):  # of a study that is done and locked nothing can be removed
-            formats.Stage(outputs_of(record, sidecar_of(job.volume)), overwrite=True).sweep()
-        return record, "skipped"
     limits = [size for size in (limit, cluster.own_memory()) if size is not None]
     if limits:
         require_within(needed(job), min(limits))
@@ -294,7 +322,7 @@ def _record_of(job: Job, look: bool, limit: int | None, warnings: list[str]) -> 
     _make_folders(job)
     forget_peak_memory()
     unless = (lambda: finished(job)) if look else (lambda: None)
-    return pipeline.run(job, notify=warnings.append, unless=unless).record, "done"
+    return pipeline.run(job, notify=warnings.append, unless=unless).record
 
 
 def _make_folders(job: Job) -> None:
@@ -314,9 +342,21 @@ def _make_folders(job: Job) -> None:
 def _require_free(job: Job, policy: Policy) -> None:
     if policy.resume or policy.overwrite or job.overwrite:
         return
-    for final in (job.volume, sidecar_of(job.volume)):
-        if final.exists() and formats.who_writes(sidecar_of(job.volume)) is None:
+    sidecar = sidecar_of(job.volume)
+    if formats.is_unfinished(sidecar):
+        return
+    for final in (job.volume, sidecar):
+        if final.exists():
             raise RefusedError(f"{final}: exists already; --resume skips what is done, --overwrite replaces it")
+
+
+def _mark(job: Job) -> tuple[int, int] | None:
+    """What tells one record of a job from another; None where there is none."""
+    try:
+        found = sidecar_of(job.volume).stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_ino
 
 
 def _names(planned: Planned) -> tuple[str, str, str]:

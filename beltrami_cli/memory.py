@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -141,14 +142,24 @@ def _in_mesh(mesh: Mesh, grid: Grid) -> _Surface:
 
 
 def _in_volume(job: Job, path: Path) -> _Surface:
-    """The surface of a level set or a segmentation, from the faces between its voxels of different sides."""
-    series = formats.open_series(path, spacing=spacing_for(path, job.spacing))
-    data, spacing = series.frame(0), series.grid.spacing
-    labelled = bool(job.labels or job.between) or (1 not in data.shape and is_segmentation(data))
-    sides = _sides(job, data) if labelled else [data < 0]
+    """The surface of a level set or a segmentation."""
+    found = path.stat()
+    which = (found.st_mtime_ns, found.st_size)
+    return _of_volume(path, which, spacing_for(path, job.spacing), job.labels, job.between)
+
+
+@cache  # the jobs of a study often share a surface
+def _of_volume(
+    path: Path, which: tuple[int, int], spacing: tuple[float, ...] | None, labels: str | None, between: str | None
+) -> _Surface:
+    """The surface from the faces between voxels of different sides. which: tells a file from what replaces it."""
+    series = formats.open_series(path, spacing=spacing)
+    data, steps = series.frame(0), series.grid.spacing
+    labelled = bool(labels or between) or (1 not in data.shape and is_segmentation(data))
+    sides = _sides(labels, between, data) if labelled else [data < 0]
     known = np.isfinite(data)
     faces = np.array([[_crossings(side, known, axis) for axis in range(3)] for side in sides])
-    areas = faces * (np.prod(spacing) / spacing)
+    areas = faces * (np.prod(steps) / steps)
     share = CROSSINGS_OF_CURVE if 1 in data.shape else CROSSINGS
     area = np.maximum(areas.sum(1) / share, areas.max(1)).mean()
     if labelled:
@@ -158,13 +169,13 @@ def _in_volume(job: Job, path: Path) -> _Surface:
     return _Surface(float(area), int(faces.sum(1).max()), float(making), labelled)
 
 
-def _sides(job: Job, labels: np.ndarray) -> list[np.ndarray]:
+def _sides(labels: str | None, between: str | None, data: np.ndarray) -> list[np.ndarray]:
     """Masks of the voxels whose boundaries make the surface of a segmentation."""
-    if job.between is not None:
-        return [_marked(labels, side) for side in parse_between(job.between)]
-    if job.labels is not None:
-        return [_marked(labels, parse_labels(job.labels))]
-    return [labels == np.nanmax(labels)]
+    if between is not None:
+        return [_marked(data, side) for side in parse_between(between)]
+    if labels is not None:
+        return [_marked(data, parse_labels(labels))]
+    return [data == np.nanmax(data)]
 
 
 def _marked(data: np.ndarray, labels: Labels) -> np.ndarray:

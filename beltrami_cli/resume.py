@@ -12,6 +12,9 @@ from beltrami_cli import __version__
 from beltrami_cli.config import Job
 from beltrami_cli.record import request, sha256, sidecar_of, sources_of
 
+# Of a record, what a batch tells of its job.
+_FIGURES = {"Noise", "Seconds", "Iterations", "StopReason", "Warnings"}
+
 
 def finished(job: Job) -> dict[str, Any] | None:
     """The record of an earlier run that `job` would only repeat; None where there is none, or it did something else.
@@ -26,6 +29,7 @@ def finished(job: Job) -> dict[str, Any] | None:
         record = json.loads(sidecar.read_text(encoding="utf-8"))
         same = (
             record["GeneratedBy"][0]["Version"] == __version__
+            and record.keys() >= _FIGURES
             and record["Request"] == json.loads(json.dumps(request(job)))
             and all(output.is_file() for output in outputs_of(record, sidecar))
             and [(source.get("Role"), source["SHA256"]) for source in record["Sources"]]

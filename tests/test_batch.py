@@ -332,7 +332,9 @@ class Scripted(Workers):
     def __init__(self, **outcomes: list[Row | BaseException | str | None]) -> None:
         self.outcomes, self.asked = outcomes, []
 
-    def submit(self, fn: Callable[..., Row], planned: Planned, look: bool, *rest: Any) -> Future[Row]:
+    def submit(self, fn: Callable[..., Row], planned: Planned, look: bool, only_look: bool, *rest: Any) -> Future[Row]:
+        if only_look:
+            return ended(Row(planned.name, "", "", "open"))
         self.asked.append((planned.name, look, planned.job.overwrite))
         left = self.outcomes.get(planned.name.replace("=", ""), [])
         outcome = left.pop(0) if left else "done"
@@ -361,11 +363,11 @@ def test_a_job_whose_process_died_is_tried_again_elsewhere(study, death):
     assert statuses(rows) == ["done"] * 3
     assert rows[1].tries == (3 if isinstance(death, KilledWorker) else 2)
     assert sorted(settled, key=lambda row: row.job) == rows
-    # The second try looks whether the first one had finished before its process died.
+    # Nothing was finished before the process died, so there is nothing that the second try should look at.
     assert sorted(executor.asked) == [
         ("k=1", False, True),
         ("k=2", False, True),
-        ("k=2", True, True),
+        ("k=2", False, True),
         ("k=3", False, True),
     ]
 
@@ -398,8 +400,10 @@ def test_a_busy_job_is_waited_for_with_resume_and_failed_without(study, monkeypa
     monkeypatch.setattr(batch, "_TRY_AGAIN", 0.02)
     monkeypatch.setattr(batch, "_LOOK", 0.02)
     executor = Scripted(k1=["busy", "busy", "skipped"])
-    rows = batch.run(study, executor, Policy(resume=True))
-    assert [(row.status, row.tries) for row in rows] == [("skipped", 1), ("done", 1), ("done", 1)]
+    told: list[str] = []
+    rows = batch.run(study, executor, Policy(resume=True), notify=told.append)
+    assert told == ["k=1: waits: another run is writing it"]
+    assert [(row.status, row.tries) for row in rows] == [("skipped", 0), ("done", 1), ("done", 1)]
     assert [name for name, *_ in executor.asked] == ["k=1", "k=2", "k=3", "k=1", "k=1"]
     rows = batch.run(study, Scripted(k1=["busy"]), Policy())
     assert statuses(rows) == ["failed", "done", "done"]
@@ -486,7 +490,7 @@ def test_an_unexpected_error_is_one_line_of_its_job(tmp_path, study, monkeypatch
     rows = batch.run(study[:1], Here(), Policy())
     assert rows[0].reason == "unexpected ZeroDivisionError: one two (please report it)"
     monkeypatch.setattr(resume, "__version__", "0.0.1")
-    assert batch.perform(study[0], True, None, "0.0.1").reason.startswith("worker: has beltrami_cli ")
+    assert batch.perform(study[0], True, False, None, "0.0.1").reason.startswith("worker: has beltrami_cli ")
     assert contents(tmp_path / "out") == {}
 
 
@@ -498,5 +502,59 @@ def test_what_another_run_has_just_finished_is_not_done_again(tmp_path, study, m
     monkeypatch.setattr(batch, "_TRY_AGAIN", 0.02)
     monkeypatch.setattr(batch, "finished", lambda job: None if next(first, False) else resume.finished(job))
     rows = batch.run(study[:1], Here(), Policy(resume=True))
-    assert [(row.status, row.tries) for row in rows] == [("skipped", 1)]
+    assert [(row.status, row.tries) for row in rows] == [("skipped", 0)]
     assert contents(tmp_path / "out") == before
+
+
+class Dies(Here):
+    """The process of the first job dies, before it or, with `late`, just after it."""
+
+    def __init__(self, late: bool) -> None:
+        self.late, self.alive = late, False
+
+    def submit(self, *asked: Any) -> Future[Any]:
+        if self.alive:
+            return super().submit(*asked)
+        self.alive = True
+        if self.late:
+            super().submit(*asked)
+        return ended(BrokenExecutor("killed"))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_second_try_takes_what_the_first_one_finished_and_not_what_was_there_before(tmp_path, study, late):
+    batch.run(study[:1], Here(), Policy())
+    good = contents(tmp_path / "out")
+    (tmp_path / "out" / "1.nii.gz").write_bytes(b"damaged by hand")
+    rows = batch.run(study[:1], Dies(late), Policy(overwrite=True))
+    assert [(row.status, row.tries) for row in rows] == [("done", 2)]
+    assert contents(tmp_path / "out")["1.nii.gz"] == good["1.nii.gz"]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), ValueError("odd")])
+def test_an_estimate_that_fails_fails_its_job_alone(study, monkeypatch, error):
+    def estimate(job: object) -> int:
+        if job == study[1].job:
+            raise error
+        return 1
+
+    monkeypatch.setattr(batch, "needed", estimate)
+    rows = batch.run(study, Here(), Policy())
+    assert statuses(rows) == ["done", "failed", "done"]
+    assert rows[1].reason.startswith(("out of memory", "unexpected ValueError: odd"))
+    assert batch.foresee(study[1], Policy()).what == "fail"
+
+
+def test_what_is_done_is_skipped_whatever_memory_it_would_need(study):
+    batch.run(study, Here(), Policy())
+    assert statuses(batch.run(study, Here(), Policy(resume=True, memory=1000))) == ["skipped"] * 3
+
+
+def test_a_record_without_figures_is_no_record(tmp_path, study):
+    batch.run(study[:1], Here(), Policy())
+    sidecar = tmp_path / "out" / "1.json"
+    record = json.loads(sidecar.read_text())
+    del record["Seconds"]
+    sidecar.write_text(json.dumps(record))
+    assert statuses(batch.run(study[:1], Here(), Policy(resume=True))) == ["done"]
+    assert "Seconds" in json.loads(sidecar.read_text())

@@ -21,7 +21,15 @@ from command import ball, nifti, noisy
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
-BELTRAMI = [sys.executable, "-m", "beltrami_cli"]
+# The command, with less patience for schedulers that do not answer.
+PROGRAM = """
+import sys
+from beltrami_cli import cluster
+from beltrami_cli.cli import main
+cluster._ANSWER = 3
+sys.exit(main())
+"""
+BELTRAMI = [sys.executable, "-c", PROGRAM]
 STEPS = {"short": 20, "long": 8_000}  # the long one takes some seconds
 
 pytestmark = pytest.mark.slow

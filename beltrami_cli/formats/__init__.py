@@ -28,7 +28,7 @@ from beltrami_cli.formats.overlays import (
 )
 from beltrami_cli.formats.plain_mesh import read_curve, read_values
 from beltrami_cli.formats.series import Series, counted
-from beltrami_cli.formats.staging import Stage, who_writes
+from beltrami_cli.formats.staging import Stage, is_unfinished, who_writes
 from beltrami_cli.formats.structures import STRUCTURES, parse_structure, structure_of_name
 from beltrami_cli.formats.surfaces import is_surface, read_surface, surface_format
 from beltrami_cli.grid import Grid, Volume
@@ -42,6 +42,7 @@ __all__ = [
     "is_npy",
     "is_overlay",
     "is_surface",
+    "is_unfinished",
     "mesh_beside",
     "mesh_files",
     "mesh_format",

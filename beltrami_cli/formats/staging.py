@@ -45,6 +45,11 @@ def who_writes(mark: Path) -> dict[str, Any] | None:
         return None
 
 
+def is_unfinished(mark: Path) -> bool:
+    """True where a run was killed while it put its files in place, of which `mark` is the last."""
+    return not mark.exists() and (_hidden(mark) / mark.name).exists()
+
+
 class Stage:
     """Stands between a run and the final names of its outputs.
 
@@ -135,7 +140,7 @@ class Stage:
 
         What a run has put in place that was killed before its mark, which still lies in the hidden folder, does not.
         """
-        unfinished = bool(self._finals) and self.path(self._finals[-1]).exists() and not self._finals[-1].exists()
+        unfinished = bool(self._finals) and is_unfinished(self._finals[-1])
         for final in self._finals:
             _require_free(final, self._overwrite or unfinished, self._inputs)
 
