@@ -17,7 +17,15 @@ from beltrami_cli.config import Settings
 from beltrami_cli.errors import BeltramiError, RefusedError
 from beltrami_cli.grid import Canonical, Volume, require_same_grid
 from beltrami_cli.inputs import Warnings, band_of, require_usable
-from beltrami_cli.metrics import Difference, Distance, Tolerances, difference, distance_between
+from beltrami_cli.metrics import (
+    Difference,
+    Distance,
+    NoValues,
+    Tolerances,
+    difference,
+    distance_between,
+    require_scales,
+)
 from beltrami_cli.surface import Mesh
 
 REMEDY = "bring them onto one grid first, for example with denoise --resample"
@@ -48,18 +56,24 @@ class Near:
 
 @dataclass(frozen=True)
 class Terms:
-    """How values are compared: volumes near a surface only; angles of this period; full scale for PSNR, data units."""
+    """How values are compared: volumes near a surface only; angles of this period; full scale for PSNR, data units.
+
+    Raises RefusedError for a period or full scale that is not a finite number above 0.
+    """
 
     near: Near | None = None
     period: float | None = None
     data_range: float | None = None
+
+    def __post_init__(self) -> None:
+        require_scales(self.period, self.data_range)
 
 
 @dataclass(frozen=True)
 class Comparison:
     """How B differs from the reference A.
 
-    values: None where they could not be compared, and of two meshes that hold none. distance: of two meshes.
+    values: None where they could not be compared, and where neither has any. distance: of two meshes.
     not_compared: why the values of two meshes, of which at least one holds some, could not be compared.
     """
 
@@ -114,7 +128,7 @@ def compare_files(a: Path, b: Path, terms: Terms) -> Comparison:
     """B against the reference A, two volumes, two meshes or two files of vertex data.
 
     Raises RefusedError where they are not of one kind, or of grids or sizes that differ; DataError where one cannot be
-    read or no value is in both.
+    read or no value is in both. Two meshes that have no value are compared by their places.
     """
     match common_kind(a, b):
         case "volume":
@@ -128,7 +142,7 @@ def compare_files(a: Path, b: Path, terms: Terms) -> Comparison:
 def compare_each(a: Path, b: Path, names: Sequence[str], terms: Terms) -> Iterator[tuple[str, Comparison | str]]:
     """The files of these names in the folders A and B, one after another; a line instead where that is impossible.
 
-    Of `terms`, the surface to be near to is for the volumes alone.
+    Of `terms`, the surface to be near to is for the volumes alone. Where neither has a value there is nothing to judge.
     """
     for name in names:
         yield name, _compared_or_reason(a / name, b / name, terms)
@@ -137,6 +151,8 @@ def compare_each(a: Path, b: Path, names: Sequence[str], terms: Terms) -> Iterat
 def _compared_or_reason(a: Path, b: Path, terms: Terms) -> Comparison | str:
     try:
         return compare_files(a, b, terms)
+    except NoValues:  # an empty map is as good as its reference
+        return Comparison(None)
     except BeltramiError as error:
         return str(error).splitlines()[0]
     except MemoryError:
@@ -208,12 +224,27 @@ def _compare_volumes(a: Path, b: Path, terms: Terms) -> Difference:
     flat = near is not None and 1 in near.psi.grid.shape
     first, second = (formats.read_volume(path, dtype=np.float64, channels=True, plane=flat) for path in (a, b))
     require_same_grid(first.grid, f"A {a}", second.grid, f"B {b}", remedy=REMEDY)
+    _require_same_numbers(first, f"A {a}", second, f"B {b}")
     x, y = _parts(first), _parts(second)
     mask = None
     if near is not None:
         require_same_grid(first.grid, f"A {a}", near.psi.grid, near.name, remedy=REMEDY)
         mask = near.mask if x.ndim == 3 else np.broadcast_to(near.mask[..., None], x.shape)
     return difference(x, y, mask=mask, period=terms.period, data_range=terms.data_range)
+
+
+def _require_same_numbers(first: Volume, first_name: str, second: Volume, second_name: str) -> None:
+    kinds = ["complex" if np.iscomplexobj(volume.data) else "real" for volume in (first, second)]
+    if kinds[0] != kinds[1]:
+        raise RefusedError(
+            f"{first_name} is {kinds[0]}, {second_name} is {kinds[1]}; expected two of one kind: extract the same part "
+            "of both"
+        )
+    if first.channels != second.channels:
+        raise RefusedError(
+            f"channels or frames differ: {first_name} has {first.channels}, {second_name} {second.channels}; expected "
+            "as many in both: extract those that correspond"
+        )
 
 
 def _parts(volume: Volume) -> np.ndarray:
@@ -244,7 +275,10 @@ def _compare_meshes(a: Path, b: Path, terms: Terms) -> Comparison:
     if reason := _why_not(values[0], values[1], distance):
         return Comparison(None, distance, reason)
     x, y = (np.concatenate([columns[name] for name in values[0]]) for columns in values)
-    return Comparison(difference(x, y, period=terms.period, data_range=terms.data_range), distance)
+    try:
+        return Comparison(difference(x, y, period=terms.period, data_range=terms.data_range), distance)
+    except NoValues:
+        return Comparison(None, distance)
 
 
 def _read_mesh(path: Path) -> Mesh:

@@ -18,6 +18,10 @@ SPREAD = 0.1
 SAME_PLACE = 1e-3
 
 
+class NoValues(DataError):
+    """Neither array has a value at any of the places that are looked at."""
+
+
 @dataclass(frozen=True)
 class Tolerances:
     """How far B may be from A; None is no tolerance.
@@ -52,7 +56,8 @@ class Tolerances:
 class Difference:
     """B minus A over the values that are finite in both, in data units; of several channels each is a value.
 
-    compared: values that are finite in both. only_in_a, only_in_b: those that are in only one.
+    compared: values that are finite in both. only_in_a, only_in_b: those that are in only one; infinity in A against
+    -infinity or none in B is only in A, and infinity in both is neither compared nor missing.
     data_range: what psnr counts as the full scale. psnr: 20 log10(data_range / rms) in dB, inf where A equals B.
     correlation: Pearson's, or the circular coefficient for angles; NaN where A or B is constant.
     """
@@ -138,15 +143,14 @@ def difference(
 ) -> Difference:
     """Compare B with the reference A, arrays of one shape; NaN and infinite values count as missing.
 
+    Figures are of float64: whole numbers above 2^53 (9e15) are rounded to it and may then be equal.
     mask: of the same shape; only where it is true (not zero) is looked at.
     period: the values are angles of this period, and differences are wrapped to -period/2 .. period/2.
     data_range: full scale for PSNR in data units; by default A's range over the compared voxels, or the period.
     Raises RefusedError for shapes that differ or a period or range that is not positive, DataError where no voxel
-    has a value in both.
+    has a value in both, of the kind NoValues where none has one in either.
     """
-    for name, size in (("period", period), ("data range", data_range)):
-        if size is not None and not 0 < size < math.inf:
-            raise RefusedError(f"{name} of the comparison: found {size:g}, expected a finite number above 0")
+    require_scales(period, data_range)
     if a.shape != b.shape or (mask is not None and mask.shape != a.shape):
         shapes = [array.shape for array in (a, b, mask) if array is not None]
         raise RefusedError(
@@ -155,32 +159,61 @@ def difference(
     looked_at = np.ones(a.shape, bool) if mask is None else mask != 0
     in_a, in_b = np.isfinite(a) & looked_at, np.isfinite(b) & looked_at
     both = in_a & in_b
+    only_in_a, only_in_b = _in_only_one(a, b, looked_at & ~both)
     if not both.any():
-        raise DataError(
-            f"nothing to compare: of {looked_at.sum()} places looked at, {in_a.sum()} have a value in A and "
+        kind = DataError if only_in_a or only_in_b or not looked_at.any() else NoValues
+        raise kind(
+            f"nothing to compare: of {looked_at.sum()} places looked at, {in_a.sum()} have a finite value in A and "
             f"{in_b.sum()} in B, none in both"
         )
     x, y = a[both].astype(float, copy=False), b[both].astype(float, copy=False)
     with np.errstate(over="ignore", invalid="ignore"):  # near 1e308 a figure may be inf, which breaks any tolerance
-        d = y - x if period is None else wrapped(y - x, period)
-        rms = float(np.sqrt(np.mean(d**2)))
+        max_abs, mean, rms = _sizes(x, y, period)
         scale = data_range or period or float(x.max() - x.min())
         return Difference(
-            compared=int(both.sum()),
-            only_in_a=int((in_a & ~both).sum()),
-            only_in_b=int((in_b & ~both).sum()),
-            max_abs=float(np.abs(d).max()),
+            compared=x.size,
+            only_in_a=only_in_a,
+            only_in_b=only_in_b,
+            max_abs=max_abs,
             rms=rms,
-            mean=float(d.mean()),
+            mean=mean,
             data_range=scale,
             psnr=_psnr(scale, rms),
             correlation=_correlation(x, y) if period is None else _circular_correlation(x, y, period),
         )
 
 
+def require_scales(period: float | None, data_range: float | None) -> None:
+    """Raise RefusedError for a period or a full scale of a comparison that is not a finite number above 0."""
+    for name, size in (("period", period), ("data range", data_range)):
+        if size is not None and not 0 < size < math.inf:
+            raise RefusedError(f"{name} of the comparison: found {size:g}, expected a finite number above 0")
+
+
 def wrapped(d: np.ndarray, period: float) -> np.ndarray:
     """Differences of angles (data units) brought to -period/2 <= d < period/2."""
-    return (d + period / 2) % period - period / 2
+    turned = d + period / 2
+    turned %= period
+    turned -= period / 2
+    return turned
+
+
+def _in_only_one(a: np.ndarray, b: np.ndarray, places: np.ndarray) -> tuple[int, int]:
+    """How many values are only in A and only in B, at places where at most one of them is finite."""
+    p, q = a[places], b[places]
+    differ = (p != q) & ~(np.isnan(p) & np.isnan(q))
+    in_b = differ & (np.isfinite(q) | np.isnan(p))
+    return int(differ.sum() - in_b.sum()), int(in_b.sum())
+
+
+def _sizes(x: np.ndarray, y: np.ndarray, period: float | None) -> tuple[float, float, float]:
+    """The largest size, the mean and the root mean square of y - x; in place, since they fill the memory."""
+    d = y - x if period is None else wrapped(y - x, period)
+    mean = float(d.mean())
+    np.abs(d, out=d)
+    largest = float(d.max())
+    np.square(d, out=d)
+    return largest, mean, float(np.sqrt(d.mean()))
 
 
 def _psnr(data_range: float, rms: float) -> float:
@@ -193,10 +226,12 @@ def _psnr(data_range: float, rms: float) -> float:
 
 
 def _correlation(x: np.ndarray, y: np.ndarray) -> float:
-    """Pearson's coefficient; NaN where x or y is constant."""
+    """Pearson's coefficient; NaN where x or y is constant. Takes their means off them in place."""
     if np.ptp(x) == 0 or np.ptp(y) == 0:
         return math.nan
-    return _normalised_product(x - x.mean(), y - y.mean())
+    x -= x.mean()
+    y -= y.mean()
+    return _normalised_product(x, y)
 
 
 def _circular_correlation(x: np.ndarray, y: np.ndarray, period: float) -> float:
@@ -207,10 +242,11 @@ def _circular_correlation(x: np.ndarray, y: np.ndarray, period: float) -> float:
     """
     if np.ptp(x) == 0 or np.ptp(y) == 0:
         return math.nan
-    a, b = (np.exp(2j * np.pi / period * t) for t in (x, y))
-    if min(abs(a.mean()), abs(b.mean())) < SPREAD:
-        return float(abs((a * b.conj()).mean()) - abs((a * b).mean()))
-    p, q = ((t * np.exp(-1j * np.angle(t.mean()))).imag for t in (a, b))
+    turn = 2 * np.pi / period
+    means = [np.exp(1j * turn * t).mean() for t in (x, y)]
+    if min(map(abs, means)) < SPREAD:
+        return float(abs(np.exp(1j * turn * (x - y)).mean()) - abs(np.exp(1j * turn * (x + y)).mean()))
+    p, q = (np.sin(turn * t - np.angle(mean)) for t, mean in zip((x, y), means, strict=True))
     return _normalised_product(p, q)
 
 

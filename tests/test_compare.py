@@ -12,6 +12,7 @@ import pytest
 from command import Run, ball, beltrami, contents, done, nifti, noisy, npy, refused
 
 from beltrami_cli import comparison, formats
+from beltrami_cli.errors import RefusedError
 from beltrami_cli.surface import Mesh
 
 
@@ -143,7 +144,8 @@ def test_channels_are_compared_value_by_value(tmp_path):
     assert found["rms"] == pytest.approx(2 / np.sqrt(3), rel=1e-3)
     near = figures(a, b, "--levelset", nifti(tmp_path / "psi.nii.gz", ball()), "--within", "1")
     assert near["compared"] == 3 * (np.abs(ball()) <= 1).sum()
-    assert "shapes differ" in refused("compare", a, nifti(tmp_path / "one.nii.gz", noisy()))
+    one = nifti(tmp_path / "one.nii.gz", noisy())
+    assert f"channels or frames differ: A {a} has 3, B {one} 1" in refused("compare", a, one)
 
 
 def test_complex_numbers_are_compared_by_their_parts(tmp_path):
@@ -152,6 +154,9 @@ def test_complex_numbers_are_compared_by_their_parts(tmp_path):
     found = figures(a, b)
     assert found["compared"] == 2 * waves.size
     assert (found["max_abs"], found["mean"]) == (pytest.approx(3), pytest.approx(1.5))
+    real = npy(tmp_path / "real.npy", noisy())
+    assert f"A {a} is complex, B {real} is real" in refused("compare", a, real)
+    assert f"A {real} is real, B {a} is complex" in refused("compare", real, a)
 
 
 # Values at vertices
@@ -338,6 +343,25 @@ def test_missing_values_are_judged_where_it_is_asked(tmp_path):
     assert (run.code, run.message) == (1, "out of tolerance: 14 values are in only one (7 in A, 7 in B), over 13")
 
 
+def test_infinite_values_are_judged_as_missing_ones(tmp_path):
+    values = noisy((8, 8))
+    other = values.copy()
+    values[0, 0], other[0, 0] = np.inf, -np.inf
+    a, b = npy(tmp_path / "a.npy", values), npy(tmp_path / "b.npy", other)
+    done("compare", a, a, "--max-abs", "0", "--max-missing", "0")
+    run = beltrami("compare", a, b, "--max-abs", "0", "--max-missing", "0")
+    assert (run.code, run.message) == (1, "out of tolerance: 1 values are in only one (1 in A, 0 in B), over 0")
+
+
+def test_meshes_without_any_value_have_places(tmp_path):
+    nothing = np.full(36, np.nan, np.float32)
+    a, b = mesh(tmp_path / "a.ply", sheet(6, nothing)), mesh(tmp_path / "b.ply", sheet(6, nothing, at=2.0))
+    assert "values    neither has any" in done("compare", a, b).out
+    assert beltrami("compare", a, a, "--max-abs", "0").code == 0
+    assert "vertices moved by up to 2 mm" in beltrami("compare", a, b, "--max-abs", "0").err
+    assert "nothing to compare" in refused("compare", a, mesh(tmp_path / "c.ply", sheet(6, VALUES)), code=1)
+
+
 # Folders
 
 
@@ -415,7 +439,7 @@ def test_a_pair_that_fails_does_not_stop_the_others(folders):
     (b / "sub-01" / "map.npy").write_bytes(b"\x93NUMPY")
     (b / "sub-01" / "map.ply").unlink()
     (b / "sub-01" / "map.ply").symlink_to("nowhere.ply")
-    npy(a / "nothing.npy", np.full((4, 4), np.nan))
+    npy(a / "nothing.npy", noisy((4, 4)))
     npy(b / "nothing.npy", np.full((4, 4), np.nan))
     run, found = of_folders(a, b, "--max-abs", "0")
     errors = {name: entry["error"] for name, entry in found["files"].items() if "error" in entry}
@@ -426,6 +450,28 @@ def test_a_pair_that_fails_does_not_stop_the_others(folders):
     assert not any("\n" in error for error in errors.values())
     run = beltrami("compare", a, b, "-q")
     assert run.out == "" and len(run.err.splitlines()) == 5 and "angle.nii.gz: failed: grids differ" in run.err
+
+
+def test_a_pair_without_any_value_is_no_failure(folders):
+    for folder in folders:
+        npy(folder / "empty.npy", np.full((4, 4), np.nan))
+        metric(folder / "lh.empty.func.gii", np.full(25, np.nan, np.float32))
+    names = ["--include", "*empty*"]
+    run, found = of_folders(*folders, "--max-abs", "0", "--max-missing", "0", *names)
+    assert (run.code, found["broken"]) == (0, False)
+    assert found["files"] == {"empty.npy": {"broken": []}, "lh.empty.func.gii": {"broken": []}}
+    _, *rows = done("compare", *folders, "--max-abs", "0", *names).out.splitlines()
+    assert [row.split()[1:] for row in rows] == [["-"] * 5 + ["ok"]] * 2
+    assert done("compare", *folders, *names).out.count("not judged") == 2
+    empty = folders[0] / "empty.npy"
+    assert "nothing to compare" in refused("compare", empty, empty, code=1)
+
+
+def test_scales_that_mean_nothing_are_refused_before_the_first_pair(folders):
+    assert "data range of the comparison: found -1" in refused("compare", *folders, "--data-range", "-1")
+    assert "period" in refused("compare", *folders, "--period", "-360")
+    with pytest.raises(RefusedError, match="period of the comparison: found 0"):
+        comparison.Terms(period=0)
 
 
 def test_a_defect_costs_one_file(folders, monkeypatch):

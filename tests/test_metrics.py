@@ -2,12 +2,13 @@
 
 import json
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from beltrami_cli.errors import DataError, RefusedError
-from beltrami_cli.metrics import Tolerances, difference, distance_between, wrapped
+from beltrami_cli.metrics import NoValues, Tolerances, difference, distance_between, wrapped
 from beltrami_cli.surface import Mesh
 
 RNG = np.random.default_rng(5)
@@ -39,8 +40,20 @@ def test_missing_values_are_counted_not_compared():
     b[1, :3, 0] = np.nan
     b[0, 0, 0] = np.inf
     d = difference(a, b)
-    assert (d.compared, d.only_in_a, d.only_in_b) == (A.size - 5, 3, 1)
+    assert (d.compared, d.only_in_a, d.only_in_b) == (A.size - 5, 3, 2)
     assert d.max_abs == pytest.approx(1) and d.mean == pytest.approx(1)
+
+
+def test_infinite_values_that_differ_are_in_only_one():
+    inf, nan = np.inf, np.nan
+    #             both  alike            only in A                        only in B
+    a = np.array([1.0, inf, -inf, nan, inf, -inf, inf, 2.0, 2.0, nan, nan, inf])
+    b = np.array([1.5, inf, -inf, nan, -inf, inf, nan, -inf, nan, inf, 3.0, 3.0])
+    d = difference(a, b)
+    assert (d.compared, d.only_in_a, d.only_in_b, d.max_abs) == (1, 5, 3, 0.5)
+    assert d.exceeds(Tolerances(max_missing=0)) != []
+    d = difference(a, b, mask=np.arange(12) < 5)
+    assert (d.compared, d.only_in_a, d.only_in_b) == (1, 1, 0)
 
 
 def test_mask_limits_what_is_looked_at():
@@ -153,5 +166,38 @@ def test_shapes_that_differ_are_refused():
 
 
 def test_no_voxel_in_common_is_an_error():
-    with pytest.raises(DataError, match="120 have a value in A and 0 in B"):
-        difference(A, np.full(A.shape, np.nan))
+    nothing = np.full(A.shape, np.nan)
+    with pytest.raises(DataError, match="120 have a finite value in A and 0 in B") as caught:
+        difference(A, nothing)
+    assert not isinstance(caught.value, NoValues)
+    for a, b in ((nothing, nothing), (nothing - np.inf, nothing), (A * 0 + np.inf, A * 0 + np.inf)):
+        with pytest.raises(NoValues, match="nothing to compare: of 120 places looked at, 0 have a finite value in A"):
+            difference(a, b)
+    for a, b, options in (
+        (nothing, np.full(A.shape, np.inf), {}),  # is only in B
+        (A, A, {"mask": np.zeros(A.shape)}),  # nothing is looked at
+    ):
+        with pytest.raises(DataError) as caught:
+            difference(a, b, **options)
+        assert not isinstance(caught.value, NoValues)
+
+
+def test_what_is_compared_is_left_as_it_was():
+    a, b = A.copy(), A + 1
+    for options in ({}, {"period": 360.0}):
+        difference(a, b, **options)
+    assert np.array_equal(a, A) and np.array_equal(b, A + 1)
+
+
+@pytest.mark.parametrize("period, most", [(None, 31), (360.0, 62)])
+def test_memory(period, most):
+    """Bytes beside A and B for each value: three of float64, of angles seven, and those of masks."""
+    a = np.random.default_rng(0).normal(100, 5, 200_000)
+    b = a + 1
+    tracemalloc.start()
+    try:
+        difference(a, b, period=period)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak / a.size < most

@@ -361,6 +361,20 @@ def test_files_cut_short(tmp_path, name):
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
+def test_stl_cut_short_or_damaged(tmp_path, kind):
+    pyramid = trimesh.Trimesh(2.1 * VERTICES, FACES, process=False)  # some bytes are no text
+    whole = pyramid.export(file_type=kind)
+    whole = whole if isinstance(whole, bytes) else whole.encode()
+    path = tmp_path / "m.stl"
+    path.write_bytes(whole)
+    assert len(read_surface(path).cells) == len(FACES)
+    for broken in (whole[:-9], whole[: len(whole) // 2], whole[:90], whole[:40], whole + whole[:90], b""):
+        path.write_bytes(broken)
+        with pytest.raises(DataError, match=r"m\.stl: cannot be read as STL \(cut short or damaged\); expected"):
+            read_surface(path)
+
+
 @pytest.mark.parametrize("name", ["m.surf.gii", "m.ply", "m.obj", "m.stl", "m.vtk"])
 def test_files_of_another_kind(tmp_path, name):
     (tmp_path / name).write_bytes(b"not what the suffix says\n\0\xff" * 9)

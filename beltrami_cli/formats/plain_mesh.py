@@ -148,12 +148,29 @@ def write_obj_lines(path: Path, mesh: Mesh) -> None:
 def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
+    if kind == "STL":
+        _require_whole_stl(path)
     mesh = trimesh.load(path, file_type=kind.lower(), process=False)
     if kind == "STL":
         mesh.merge_vertices()
     # A file without faces comes as a cloud of points.
     cells = getattr(mesh, "faces", np.empty((0, 3)))
     return np.array(mesh.vertices, float), np.array(cells, np.int32)
+
+
+def _require_whole_stl(path: Path) -> None:
+    """Raise ValueError unless it has as many bytes as its header says, 50 for each triangle, or ends as text does.
+
+    trimesh takes bytes of any other number for text, and reads of text the solids that are complete.
+    """
+    with path.open("rb") as file:
+        head = file.read(84)
+        size = file.seek(0, 2)
+        file.seek(max(0, size - 1024))  # a last line is shorter
+        last = file.read().strip().rpartition(b"\n")[2]
+    is_whole_binary = len(head) == 84 and size == 84 + 50 * int.from_bytes(head[80:], "little")
+    if not is_whole_binary and not last.strip().lower().startswith(b"endsolid"):
+        raise ValueError("cut short or damaged")
 
 
 def _read_ply(path: Path) -> dict[str, dict[str, np.ndarray]]:
