@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -23,7 +24,8 @@ from beltrami_cli.executors import Workers, alone, deaths
 from beltrami_cli.memory import needed, require_within
 from beltrami_cli.record import forget_peak_memory, sidecar_of
 from beltrami_cli.resume import finished, outputs_of
-from beltrami_cli.study import Planned
+from beltrami_cli.study import Planned, files_of
+from beltrami_cli.survey import Files, survey
 
 # open: looked at, and not done yet. busy: another run is writing its outputs.
 Status = Literal["done", "skipped", "failed", "open", "busy"]
@@ -233,7 +235,8 @@ class _Batch:
             self.looked.add(k)
             self.waiting.appendleft(k)
         elif row.status == "busy":
-            self._settle(k, replace(row, status="failed"))
+            reason = f"{row.reason}; with --resume the batch waits for it, and skips what it did"
+            self._settle(k, replace(row, status="failed", reason=reason))
         elif row.status == "skipped" and not self.policy.resume:
             self._settle(k, replace(row, status="done"))
         else:
@@ -261,10 +264,13 @@ def foresee(planned: Planned, policy: Policy) -> Plan:
     try:
         if policy.resume and finished(planned.job) is not None:
             return Plan("skip")
-        size = needed(planned.job)
+        scene = survey(planned.job)
+        size = needed(planned.job, scene)
+        for limit in (policy.memory, planned.job.memory):
+            if limit is not None:
+                require_within(size, limit)
         _require_free(planned.job, policy)
-        if policy.memory is not None:
-            require_within(size, policy.memory)
+        _require_writable(planned.job, Files(planned.job, scene).all, policy)
     except Exception as error:
         return Plan("fail", _reason(error))
     return Plan("run", "", size)
@@ -331,12 +337,35 @@ def _make_folders(job: Job) -> None:
         formats.require_file(path)
     outputs = (job.volume, *(job.mesh or ()), job.filled, *(file for _, file in job.on))
     for folder in {output.parent for output in outputs if output is not None}:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RefusedError(
-                f"{folder}: cannot be made ({error.strerror}); choose another folder for the output"
-            ) from error
+        _make_folder(folder)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RefusedError(
+            f"{folder}: cannot be made ({error.strerror}); choose another folder for the output"
+        ) from error
+
+
+def _require_writable(job: Job, files: Iterable[Path], policy: Policy) -> None:
+    """Raise RefusedError where a file of the job could not be written, its folder being made where there is none."""
+    there = []
+    for file in files:
+        if file.parent.is_dir():
+            there.append(file)
+        else:
+            _require_can_be_made(file.parent)
+    formats.Stage(there, overwrite=policy.resume or policy.overwrite or job.overwrite, inputs=job.all_inputs)
+
+
+def _require_can_be_made(folder: Path) -> None:
+    """Raise RefusedError unless what there is of a folder's path is a folder that can be written to."""
+    there = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        what = "cannot be written to" if there.is_dir() else "is no folder"
+        raise RefusedError(f"{there}: {what}; choose another folder for the output")
 
 
 def _require_free(job: Job, policy: Policy) -> None:
@@ -403,14 +432,41 @@ def _line(error: BaseException) -> str:
 
 
 def write_summary(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows as .csv or .json, replacing what is there; raises RefusedError for another suffix."""
-    text = _as_csv(rows) if summary_format(path) == "csv" else _as_json(rows)
+    """Write rows as .csv or .json, replacing what is there; makes its folder. Raises RefusedError where it cannot."""
+    text = _as_csv(rows) if _summary_format(path) == "csv" else _as_json(rows)
+    _make_folder(path.parent)
     with formats.Stage([path], overwrite=True) as stage, formats.writing(path):
         stage.path(path).write_text(text, encoding="utf-8", newline="")
         stage.commit()
 
 
-def summary_format(path: Path) -> str:
+def require_summary(path: Path, study: Sequence[Planned], policy: Policy) -> None:
+    """Raise RefusedError where a summary cannot be written, or would replace what is no summary."""
+    _summary_format(path)
+    if os.path.realpath(path) in files_of(study):
+        raise RefusedError(f"{path}: is a file of the study, which the summary would replace; give another name")
+    if os.path.lexists(path):
+        if not (policy.resume or policy.overwrite):
+            raise RefusedError(f"{path}: exists already; --resume goes on where it stopped, or give another name")
+        if not _is_summary(path):
+            raise RefusedError(f"{path}: is no summary of a batch, and stays; give another name")
+    _require_can_be_made(path.absolute().parent)
+
+
+def _is_summary(path: Path) -> bool:
+    """True where a file looks as `write_summary` writes it."""
+    names = list(Row.__dataclass_fields__)
+    try:
+        text = path.read_text(encoding="utf-8")
+        if _summary_format(path) == "csv":
+            return text.split("\n")[0] == ",".join(names)
+        rows = json.loads(text)
+        return isinstance(rows, list) and all(isinstance(row, dict) and list(row) == names for row in rows)
+    except (OSError, ValueError):
+        return False
+
+
+def _summary_format(path: Path) -> str:
     """csv or json; raises RefusedError for another suffix."""
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".json"):

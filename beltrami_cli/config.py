@@ -518,14 +518,28 @@ def fields_of(path: Path, tables: Mapping[str, Any]) -> dict[str, Any]:
     return given
 
 
-def make_job(given: Mapping[str, Any]) -> Job:
-    """A checked Job from fields by name; DATA and OUT must be among them."""
+def make_job(given: Mapping[str, Any], *, in_config: bool = False) -> Job:
+    """A checked Job from fields by name; DATA and OUT must be among them.
+
+    in_config: the fields are those of a config file alone, and what is missing is missing there.
+    """
+    if in_config:
+        _require_files(given)
     for name, what in (("data", "DATA"), ("volume", "OUT (-o FILE)")):
         if given.get(name) is None:
             raise RefusedError(f"{what} is missing: beltrami denoise LEVELSET DATA -o OUT")
     names = {f.name for f in fields(Settings)}
     settings = Settings(**{k: v for k, v in given.items() if k in names})
     return Job(**{k: v for k, v in given.items() if k not in names}, settings=settings)
+
+
+def _require_files(given: Mapping[str, Any]) -> None:
+    """Raise RefusedError, in the words of a config, where one of a run does not name its files."""
+    keys = ["[input] data", "[output] volume", *([] if given.get("flat") else ["[input] levelset"])]
+    for key in keys:
+        if given.get(key.split()[1]) is None:
+            surface = ", or flat = true in [flow] where there is no surface" if key.endswith("levelset") else ""
+            raise RefusedError(f"{key} is missing; expected the name of a file{surface}")
 
 
 def overlaid(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -87,6 +87,11 @@ def part(planned: Sequence[Planned], given: str) -> list[Planned]:
     return list(planned[first - 1 :: step])
 
 
+def files_of(planned: Iterable[Planned]) -> set[str]:
+    """Every file that the jobs are made of, read or write, as far as names tell, links resolved."""
+    return {os.path.realpath(file) for each in planned for file in (each.config, *each.job.all_inputs, *_written(each))}
+
+
 def _jobs(config: Path, stem: str, *, several: bool) -> Iterator[tuple[str, Job]]:
     """The jobs of a config with their names."""
     tables = read_tables(config)
@@ -109,7 +114,8 @@ def _jobs(config: Path, stem: str, *, several: bool) -> Iterator[tuple[str, Job]
 
 def _job(config: Path, where: str, tables: Mapping[str, Any]) -> Job:
     try:
-        return make_job({name: _absolute(value) for name, value in fields_of(config, tables).items()})
+        given = fields_of(config, tables)
+        return make_job({name: _absolute(value) for name, value in given.items()}, in_config=True)
     except RefusedError as error:
         raise RefusedError(f"{where}: {str(error).removeprefix(f'{config}: ')}") from None
 
@@ -304,28 +310,30 @@ def _require_distinct(configs: Sequence[Path]) -> None:
 def _require_apart(planned: list[Planned]) -> None:
     """Raise RefusedError where two jobs write one file, or one reads what any of them writes."""
     real = cache(os.path.realpath)
+    outputs = [(each, file) for each in planned for file in _written(each)]
     writer: dict[str, Planned] = {}
-    for each in planned:
-        for file in _written(each):
-            other = writer.setdefault(real(file), each)
-            if other is not each:
-                raise RefusedError(
-                    f"{other.name} and {each.name} both write {file}; expected outputs of their own for every job: "
-                    "give each another name, as by {NAME} of [for_each]"
-                )
-    for each in planned:
-        for file in each.job.all_inputs:
-            source = writer.get(real(file))
-            if source is each:
-                raise RefusedError(
-                    f"{each.name}: {file} is an input and an output, and inputs are never changed; choose another name "
-                    "for the output"
-                )
-            if source is not None:
-                raise RefusedError(
-                    f"{each.name} reads {file}, which {source.name} writes; jobs of a batch run in any order: narrow "
-                    "the pattern, or run two batches"
-                )
+    for each, file in outputs:
+        writer.setdefault(real(file), each)
+    # Inputs first: that they would be lost is worse than that two jobs write one file, which may be true as well.
+    for each, file in [(reader, file) for reader in planned for file in reader.job.all_inputs]:
+        source = writer.get(real(file))
+        if source is each:
+            raise RefusedError(
+                f"{each.config}: {each.name}: {file} is an input and an output, and inputs are never changed; choose "
+                "another name for the output"
+            )
+        if source is not None:
+            raise RefusedError(
+                f"{each.config}: {each.name} reads {file}, which {source.name} writes; jobs of a batch run in any "
+                "order: narrow the pattern, or run two batches"
+            )
+    for each, file in outputs:
+        other = writer[real(file)]
+        if other is not each:
+            raise RefusedError(
+                f"{each.config}: {other.name} and {each.name} both write {file}; expected outputs of their own for "
+                "every job: give each another name, as by {NAME} of [for_each]"
+            )
 
 
 def _written(planned: Planned) -> list[Path]:
@@ -344,7 +352,7 @@ def _written(planned: Planned) -> list[Path]:
         bare = job.mesh is None and outputs[0].name.lower().endswith(".gii")
         outputs += [file for mesh in meshes for file in formats.mesh_files(mesh, values=not bare)]
     except RefusedError as error:
-        raise RefusedError(f"{planned.name}: {error}") from None
+        raise RefusedError(f"{planned.config}: {planned.name}: {error}") from None
     return [*outputs, *(file for _, file in job.on), sidecar_of(job.volume)]
 
 

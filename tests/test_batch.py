@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import errno
+import io
 import json
 import os
 import shutil
+import signal
+import sys
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
@@ -18,8 +23,11 @@ from command import ball, beltrami, contents, done, nifti, noisy, record, refuse
 from studies import Here, essence, write_study
 from studies import batch as batch_in_processes
 
-from beltrami_cli import batch, executors, resume
+from beltrami_cli import batch, executors, pipeline, resume
 from beltrami_cli.batch import Policy, Row
+from beltrami_cli.cli import main
+from beltrami_cli.cli.batch import _values
+from beltrami_cli.cli.common import short
 from beltrami_cli.executors import Workers
 from beltrami_cli.formats import Stage
 from beltrami_cli.study import Planned, read_study
@@ -86,8 +94,9 @@ def test_the_table_and_the_summary_say_what_the_records_say(tmp_path, here):
     }
     head, *lines, sums = run.out.splitlines()
     assert head.split() == ["job", "status", "seconds", "noise", "before", "after", "stopped", "by"]
+    assert lines.pop(2) == f"    {rows[1]['reason']}"
     for row, line in zip(rows, lines, strict=True):
-        words = row["reason"].split()
+        words = []
         if row["status"] == "done":
             words = [f"{row['seconds']:.1f}", *(f"{row[f'noise_{when}']:.4g}" for when in ("before", "after"))]
             words.append("iterations")
@@ -133,18 +142,170 @@ def test_quiet_says_nothing_but_what_failed(tmp_path, here):
         (["--part", "4/3"], "part: found '4/3'"),
         (["--memory", "much"], "memory: found 'much'"),
         (["--summary", "s.txt"], "ends in .csv or .json"),
-        (["--summary", "here/s.csv"], "does not exist"),
+        (["--summary", "s.txt", "--dry-run"], "ends in .csv or .json"),
+        (["--summary", "old.csv/here/s.csv"], "old.csv: is no folder; choose another"),
         (["--summary", "study.toml"], "summary: found study.toml"),
-        (["--summary", "old.csv"], "exists already"),
+        (["--summary", "old.csv"], "exists already; --resume goes on where it stopped, or give another name"),
+        (["--summary", "old.csv", "--overwrite"], "is no summary of a batch, and stays"),
+        (["--summary", "old.json", "--resume"], "is no summary of a batch, and stays"),
+        (["--summary", "out", "--resume"], "ends in .csv or .json"),
+        (["--summary", "folder.csv", "--resume"], "is no summary of a batch"),
+        (["--summary", "out/../out/1.json", "--resume"], "is a file of the study"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_before_anything_is_done(tmp_path, monkeypatch, options, words):
     config = write_study(tmp_path, 1)
-    (tmp_path / "old.csv").write_text("old")
+    (tmp_path / "old.csv").write_text("job,status\nold,done\n")
+    (tmp_path / "old.json").write_text('[{"job": "old", "status": "done"}, 1]')
+    (tmp_path / "folder.csv").mkdir()
     monkeypatch.chdir(tmp_path)
     before = contents(tmp_path)
     assert words in refused("batch", config, *options)
     assert contents(tmp_path) == before
+
+
+def test_a_summary_replaces_a_summary_and_its_folder_is_made(tmp_path, here):
+    config = write_study(tmp_path, 2)
+    for name in ("a/b/s.csv", "a/b/s.json"):
+        summary = tmp_path / name
+        beltrami("batch", config, "--overwrite", "--summary", summary)
+        first = summary.read_text()
+        assert "exists already" in refused("batch", config, "--summary", summary)
+        assert beltrami("batch", config, "--resume", "--summary", summary).code == 0
+        assert (first.count("skipped"), summary.read_text().count("skipped")) == (0, 2)
+        assert beltrami("batch", config, "--part", "3/3", "--resume", "--summary", summary).code == 0
+        assert "skipped" not in summary.read_text()
+        assert beltrami("batch", config, "--resume", "--summary", summary).code == 0
+        assert summary.read_text().count("skipped") == 2
+
+
+def test_a_part_without_jobs_says_so(tmp_path, here):
+    config = write_study(tmp_path, 2)
+    for options in ((), ("--dry-run",)):
+        run = beltrami("batch", config, "--part", "3/3", *options)
+        assert (run.code, run.out, run.err) == (0, "no jobs in part 3/3 of 2 jobs\n", "")
+    assert beltrami("batch", config, "--part", "2/2").out.endswith("\n1 job: 1 done\n")
+
+
+def test_columns_without_a_value_are_left_out_and_skipped_jobs_tell_no_seconds(tmp_path, here):
+    config = write_study(tmp_path, 2)
+    for k in (1, 2):
+        (tmp_path / f"data-{k}.nii.gz").rename(tmp_path / f"hidden-{k}.nii.gz")
+    reasons = [f"{tmp_path}/data-{k}.nii.gz: no such file; check the path" for k in (1, 2)]
+    run = beltrami("batch", config)
+    assert run.out == (f"job  status\nk=1  failed\n    {reasons[0]}\nk=2  failed\n    {reasons[1]}\n2 jobs: 2 failed\n")
+    for k in (1, 2):
+        (tmp_path / f"hidden-{k}.nii.gz").rename(tmp_path / f"data-{k}.nii.gz")
+    beltrami("batch", config)
+    assert beltrami("batch", config, "--resume").err == "beltrami: 1/2 k=1: skipped\nbeltrami: 2/2 k=2: skipped\n"
+
+
+def test_verbose_tells_the_warnings_of_each_job(tmp_path, here):
+    data = noisy(seed=1)
+    data[8, 8, 13] = np.inf
+    config = write_study(tmp_path, 2)
+    nifti(tmp_path / "data-1.nii.gz", data)
+    run = beltrami("batch", config, "-v")
+    assert run.code == 0
+    (warning,) = record(tmp_path / "out" / "1.json")["Warnings"]
+    assert run.err.splitlines()[1] == f"beltrami: k=1: warning: {warning}"
+    assert "with warnings, see their records, or -v" in run.out
+    assert "warning" not in beltrami("batch", config, "--overwrite").err
+
+
+class Broken(io.StringIO):
+    """A stream that takes so many lines before it fails."""
+
+    def __init__(self, lines: int, number: int) -> None:
+        super().__init__()
+        self.lines, self.number = lines, number
+
+    def write(self, text: str) -> int:
+        if self.getvalue().count("\n") == self.lines:
+            raise OSError(self.number, os.strerror(self.number))
+        return super().write(text)
+
+
+@pytest.mark.parametrize("number", [errno.EPIPE, errno.EIO, errno.ENOSPC])
+def test_a_study_goes_on_where_nobody_hears_of_it(tmp_path, here, number):
+    config, said = write_study(tmp_path, 3), Broken(1, number)
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(said):
+        assert main(["batch", str(config)]) == 0
+        sys.stderr.close()  # what stood in for the broken one
+    assert said.getvalue().startswith("beltrami: 1/3 k=1: done")
+    assert out.getvalue().endswith("3 jobs: 3 done\n")
+
+
+def test_what_was_done_is_in_the_summary_where_the_table_cannot_be_told(tmp_path, here):
+    config, summary = write_study(tmp_path, 2), tmp_path / "s.csv"
+    with contextlib.redirect_stdout(Broken(1, errno.ENOSPC)), contextlib.redirect_stderr(io.StringIO()) as err:
+        assert main(["batch", str(config), "--summary", str(summary)]) == 1
+        sys.stdout.close()
+    assert err.getvalue().splitlines()[2:] == [
+        "beltrami: stdout: cannot be written to (No space left on device); check the disk"
+    ]
+    assert summary.read_text().count(",done,") == 2
+
+
+def test_closed_streams_are_no_error(tmp_path, here, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    assert main(["batch", str(write_study(tmp_path, 1))]) == 0
+    sys.stdout.close()
+    sys.stderr.close()
+
+
+class Ended(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_stopped_it_tells_how_far_it_is(tmp_path, here, monkeypatch, capfd, number, code):
+    config, summary, real = write_study(tmp_path, 4), tmp_path / "s" / "s.csv", pipeline.run
+    (tmp_path / "data-2.nii.gz").unlink()
+
+    def end(code: int) -> None:
+        raise Ended(code)
+
+    def run(job: Any, **options: Any) -> Any:
+        if job.volume.name.startswith("3"):
+            signal.raise_signal(number)
+        return real(job, **options)
+
+    monkeypatch.setattr(os, "_exit", end)
+    monkeypatch.setattr(pipeline, "run", run)
+    with pytest.raises(Ended) as ended:
+        main(["batch", str(config), "--summary", str(summary)])
+    out, err = capfd.readouterr()
+    assert (ended.value.args, out) == ((code,), "")
+    line = "beltrami: interrupted: 1 of 4 jobs done, 1 failed; the same command with --resume goes on\n"
+    assert err.endswith("\n" * (1 + (number == signal.SIGINT)) + line)
+    assert [row["job"] for row in csv.DictReader(summary.read_text().splitlines())] == ["k=1", "k=2"]
+    monkeypatch.setattr(pipeline, "run", real)
+    assert not any(name.startswith("out/.") for name in contents(tmp_path))
+    assert beltrami("batch", config, "--resume", "--summary", summary).code == 1
+    assert [row["status"] for row in csv.DictReader(summary.read_text().splitlines())] == [
+        "skipped", "failed", "done", "done"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name, shown",
+    [("subject=01 hemi=lh", "01 lh"), ("study: k=1", "study: 1"), ("torus", "torus"), ("d=a b=c x", "a c x")],
+)
+def test_what_runs_is_shown_by_its_values(name, shown):
+    assert _values(name) == shown
+
+
+def test_paths_are_told_as_seen_from_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    here = os.getcwd()
+    assert short(f"{here}/a: not '{here}/b', /x{here}/c or {here}") == f"a: not 'b', /x{here}/c or {here}"
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert short(f"{gone}/a") == f"{gone}/a"
 
 
 # Before it runs
@@ -167,14 +328,37 @@ def test_a_dry_run_tells_the_plan_and_makes_nothing(tmp_path, monkeypatch, here)
     ):
         run = beltrami("batch", config, "--dry-run", *options)
         assert (run.code, run.err) == (code, "")
-        head, *lines, sums = run.out.splitlines()
-        assert head.split() == ["job", "plan", "memory", "output"]
+        head, *lines, sums = [line for line in run.out.splitlines() if not line.startswith(" ")]
+        assert head.split() == ["job", "plan", *(["memory"] if "run" in plans else []), "output"]
         assert [line.split()[1] for line in lines] == plans
         assert all(line.split()[3] == "MB" for line, plan in zip(lines, plans, strict=True) if plan == "run")
         assert f"{len(plans)} jobs: " in sums
         assert contents(tmp_path) == before
     assert "out/1.nii.gz" in run.out
     assert str(tmp_path) not in run.out
+
+
+def block(folder: Path) -> None:
+    (folder / "out").mkdir()
+    (folder / "out" / "1.surf.gii").touch()
+
+
+@pytest.mark.parametrize(
+    "more, before, words",
+    [
+        ("[run]\nmemory = '1M'\n", lambda folder: None, "found a limit of 1.0 MB"),
+        ("", lambda folder: (folder / "out").touch(), "out: is no folder"),
+        ("", block, "out/1.surf.gii: exists already"),
+    ],
+)
+def test_a_dry_run_says_what_is_certain_to_fail(tmp_path, here, more, before, words):
+    config = write_study(tmp_path, 1, more=more)
+    before(tmp_path)
+    plan = beltrami("batch", config, "--dry-run")
+    assert plan.code == 1
+    assert words in plan.out
+    run = beltrami("batch", config)
+    assert run.code == 1
 
 
 # What is there already
@@ -407,7 +591,7 @@ def test_a_busy_job_is_waited_for_with_resume_and_failed_without(study, monkeypa
     assert [name for name, *_ in executor.asked] == ["k=1", "k=2", "k=3", "k=1", "k=1"]
     rows = batch.run(study, Scripted(k1=["busy"]), Policy())
     assert statuses(rows) == ["failed", "done", "done"]
-    assert rows[0].reason == "another run is writing it"
+    assert rows[0].reason.startswith("another run is writing it; with --resume the batch waits")
 
 
 def test_a_job_that_another_run_holds_is_busy(tmp_path, study, monkeypatch):

@@ -63,7 +63,7 @@ def test_help_names_every_option(command):
 def test_help_of_the_group_names_commands_and_exit_codes():
     run = done("--help")
     assert set(group.commands) == set(OPTIONS)
-    for word in (*OPTIONS, "Exit codes", "130", "143", "_BELTRAMI_COMPLETE"):
+    for word in (*OPTIONS, "Exit codes", "130", "143", "129", "_BELTRAMI_COMPLETE"):
         assert word in run.out
 
 
@@ -581,7 +581,7 @@ def test_process_without_a_word_too_many(scene, tmp_path):
     assert (run.returncode, run.stdout, len(run.stderr.splitlines())) == (2, "", 1)
 
 
-@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_interrupted_in_mid_run_leaves_nothing(scene, tmp_path, number, code):
     levelset, data, out = scene
     before = contents(tmp_path)

@@ -269,7 +269,8 @@ def test_interrupted_batch_leaves_nothing_half_written(tmp_path, dask):
     until(lambda: writers(tmp_path / "out"))
     running.send_signal(signal.SIGINT)
     _, err = running.communicate(timeout=10)
-    assert (running.returncode, err) == (130, "\nbeltrami: interrupted\n")
+    said = "\nbeltrami: interrupted: 0 of 2 jobs done; the same command with --resume goes on\n"
+    assert (running.returncode, err) == (130, said)
     until(lambda: not writers(tmp_path / "out"))
     assert {path.name.split(".")[0] for path in (tmp_path / "out").iterdir()} == {"0"}  # ended, and whole
     assert (tmp_path / "out" / "0.json").exists()

@@ -313,7 +313,7 @@ def test_files_of_two_kinds_are_refused(pair, tmp_path):
     assert "s.glb: cannot be compared" in refused("compare", glb, glb)
     assert "is a folder" in refused("compare", a, tmp_path)
     assert "is a folder" in refused("compare", tmp_path, a)
-    assert "no such file" in refused("compare", tmp_path, tmp_path / "nothing")
+    assert "nothing: no such file or folder" in refused("compare", tmp_path, tmp_path / "nothing")
     assert "max-abs: found -1; expected 0 or more" in refused("compare", a, a, "--max-abs", "-1")
 
 

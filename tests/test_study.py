@@ -9,7 +9,7 @@ import pytest
 
 from beltrami_cli.config import Settings, make_job, read_config
 from beltrami_cli.errors import RefusedError
-from beltrami_cli.study import Planned, part, read_study
+from beltrami_cli.study import Planned, files_of, part, read_study
 
 INPUT = """
 [input]
@@ -362,7 +362,7 @@ TWO = "[for_each]\nn = [1, 2]"
 def test_two_jobs_that_write_one_file(output, file):
     touch("1/x", "2/x", "a/x")
     message = refusal(TWO, INPUT, f"data = 'd{{n}}.npy'\n[output]\n{output}")
-    assert message.startswith("n=1 and n=2 both write ")
+    assert message.startswith("study.toml: n=1 and n=2 both write ")
     assert file in message
     assert "{NAME}" in message
 
@@ -376,7 +376,7 @@ def test_outputs_beside_out_count_too():
         (writing("p.npy", "mesh = 'o.surf.gii'"), r"o\.surf\.gii"),
         (writing("p.npy", "on = 's.ply=o.func.gii'"), r"o\.func\.gii"),
     ):
-        with pytest.raises(RefusedError, match=rf"^first and second both write .*{file}"):
+        with pytest.raises(RefusedError, match=rf"^second\.toml: first and second both write .*{file}"):
             read_study([first, write("second.toml", second)])
     other = write("second.toml", writing("p.npy"))
     assert names(read_study([first, other])) == ["first", "second"]
@@ -389,21 +389,33 @@ def test_outputs_beside_out_count_too():
 def test_a_job_that_reads_what_another_writes(line):
     touch("a.nii.gz", "a_denoised.nii.gz")
     message = refusal("[for_each]\nd = '{n}.nii.gz'", INPUT, line, "[output]\nvolume = '{n}_denoised.nii.gz'")
-    assert message.startswith("n=a_denoised reads ")
+    assert message.startswith("study.toml: n=a_denoised reads ")
     assert "a_denoised.nii.gz, which n=a writes" in message
     assert "narrow the pattern, or run two batches" in message
 
 
 def test_a_job_that_would_replace_its_input():
     message = refusal(TWO, INPUT, "data = 'd{n}.npy'\n[output]\nvolume = './d{n}.npy'")
-    assert message.startswith("n=1: ")
+    assert message.startswith("study.toml: n=1: ")
     assert "d1.npy is an input and an output, and inputs are never changed" in message
+
+
+def test_that_an_input_would_be_lost_is_said_before_that_two_jobs_write_it():
+    message = refusal(TWO, INPUT, "data = 'd.npy'\n[output]\nvolume = 'd.npy'\n[time]\nseed = '{n}'")
+    assert "d.npy is an input and an output" in message
+
+
+def test_every_file_of_a_study_is_known():
+    found = files_of(read_study([write("one.toml", writing("o.nii.gz", "on = 's.ply=v.func.gii'"))]))
+    assert {Path(file).name for file in found} == {
+        "one.toml", "psi.nii.gz", "d.npy", "s.ply", "o.nii.gz", "o.surf.gii", "o.func.gii", "v.func.gii", "o.json",
+    }  # fmt: skip
 
 
 def test_a_surface_that_another_job_writes():
     first = write("first.toml", writing("o.nii.gz"))
     second = write("second.toml", writing("p.nii.gz", "on = 'o.surf.gii=p.shape.gii'"))
-    with pytest.raises(RefusedError, match=r"^second reads .*o\.surf\.gii, which first writes"):
+    with pytest.raises(RefusedError, match=r"^second\.toml: second reads .*o\.surf\.gii, which first writes"):
         read_study([first, second])
 
 
@@ -418,9 +430,11 @@ def test_a_config_given_twice():
     [
         ((TWO, INPUT, "data='d'\n[output]\nvolume='{n}.npy'\n[band]\ndepth='{n}:1'"), "study.toml: n=2: depth: found"),
         ((TWO, INPUT, "data='{n}'\n[output]\nvolume='{n}.npy'"), "study.toml: n=1: [input] data: found 1; expected"),
-        ((TWO, INPUT, "data='{n}.npy'"), "study.toml: n=1: OUT"),
-        ((TWO, INPUT, "data='d'\n[output]\nvolume='{n}.png'"), "n=1: "),
-        ((TWO, INPUT, "data='d'\n[output]\nvolume='{n}.npy'\nmesh='{n}.xyz'"), "n=1: "),
+        ((TWO, INPUT, "data='{n}.npy'"), "study.toml: n=1: [output] volume is missing; expected"),
+        ((TWO, INPUT, "[output]\nvolume='{n}.npy'"), "study.toml: n=1: [input] data is missing; expected"),
+        (("[input]\ndata='d'\n[output]\nvolume='o.npy'",), "study.toml: [input] levelset is missing; expected"),
+        ((TWO, INPUT, "data='d'\n[output]\nvolume='{n}.png'"), "study.toml: n=1: "),
+        ((TWO, INPUT, "data='d'\n[output]\nvolume='{n}.npy'\nmesh='{n}.xyz'"), "study.toml: n=1: "),
         ((INPUT, "data='d'\n[output]\nvolume='o.npy'\n[time]\nseed=-1"), "study.toml: seed: found -1"),
         ((INPUT, "date='d'"), "study.toml: unknown key 'date' in [input]; did you mean 'data'?"),
         (("[foreach]\nn = [1]",), "study.toml: unknown section [foreach]; did you mean 'for_each'?"),

@@ -11,7 +11,7 @@ import click
 
 from beltrami_cli import __version__
 from beltrami_cli.cli.batch import batch
-from beltrami_cli.cli.common import report_error
+from beltrami_cli.cli.common import last_words, report_error, silence
 from beltrami_cli.cli.compare import compare
 from beltrami_cli.cli.demo import demo
 from beltrami_cli.cli.denoise import denoise
@@ -23,9 +23,11 @@ from beltrami_cli.cli.sample import sample
 
 # What ends a run, and the exit code that it gives.
 STOPPED: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
+if hasattr(signal, "SIGHUP"):  # a terminal that is closed, or a connection that is lost
+    STOPPED[signal.SIGHUP] = 129
 
 EPILOG = """Exit codes: 0 done; 1 the data or the numerics failed, or a comparison is out of tolerance; 2 usage, or
-refused before starting; 130 on Ctrl-C; 143 on SIGTERM.
+refused before starting; 130 on Ctrl-C; 143 on SIGTERM; 129 when the terminal is lost.
 
 Shell completion: eval "$(_BELTRAMI_COMPLETE=bash_source beltrami)" (or zsh_source, fish_source)."""
 
@@ -42,7 +44,10 @@ for command in (denoise, batch, levelset, mesh, sample, phantom, compare, info, 
 
 def main(args: list[str] | None = None) -> int:
     """Run the command line and return its exit code; every failure is one line on stderr."""
-    # A shell that starts a command in the background may have told it to ignore Ctrl-C.
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by who started this
+            silence(name)
+    # A shell that starts a command in the background may have told it to ignore Ctrl-C, and nohup a lost terminal.
     heeded = [number for number in STOPPED if signal.getsignal(number) is not signal.SIG_IGN]
     before = {number: signal.signal(number, _stop) for number in heeded}
     try:
@@ -73,9 +78,14 @@ def _stop(number: int, _frame: Any) -> None:
     """End the process here and now: an exception that meets a compiled function on its way out can crash it."""
     for other in STOPPED:  # a second one would come between two steps of this one's end
         signal.signal(other, signal.SIG_IGN)
-    staging = sys.modules.get("beltrami_cli.formats.staging")  # else nothing is being written
-    if staging is not None:
-        staging.abandon()
-    told = "\nbeltrami: interrupted\n" if number == signal.SIGINT else ""
-    os.write(2, told.encode())
-    os._exit(STOPPED[number])
+    try:
+        staging = sys.modules.get("beltrami_cli.formats.staging")  # else nothing is being written
+        if staging is not None:
+            staging.abandon()
+        words = last_words()
+        if words or number == signal.SIGINT:
+            # Not on the line of the terminal's ^C, or of a bar.
+            start = "\n" if number == signal.SIGINT or os.isatty(2) else ""
+            os.write(2, f"{start}beltrami: {': '.join(['interrupted', *words])}\n".encode())
+    finally:
+        os._exit(STOPPED[number])

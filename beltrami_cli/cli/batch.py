@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from beltrami_cli.cli.common import Command, announce_compilation, note, overwrite_option, say, short
+from beltrami_cli.cli.common import (
+    Command,
+    announce_compilation,
+    at_stop,
+    note,
+    overwrite_option,
+    say,
+    short,
+    unheard,
+)
 
 if TYPE_CHECKING:
     from beltrami_cli.batch import Policy, Row, Running
@@ -33,7 +44,9 @@ MOST_SHOWN = 3
 )
 @click.option("--resume", is_flag=True, help="Skip jobs that are done already; redo the others.")
 @click.option("--dry-run", is_flag=True, help="Print what would be run, and run nothing.")
-@click.option("--summary", type=FILE, metavar="FILE", help="Write the final table as .csv or .json.")
+@click.option(
+    "--summary", type=FILE, metavar="FILE", help="Write what became of the jobs as .csv or .json; one for each part."
+)
 @click.option("--part", metavar="K/N", help="Only every N-th job from the K-th: for a scheduler's array of jobs.")
 @click.option("--threads", type=click.IntRange(1), help="Of each job. Default: the CPUs shared by the jobs at once.")
 @click.option(
@@ -81,37 +94,58 @@ def batch(
         beltrami batch study.toml --dry-run
         beltrami batch study.toml --jobs 4 --resume --summary study.csv
 
-    Folders of outputs are made. Exit code 1 where a job failed; its reason stands in the table.
+    Folders of outputs are made. A line tells of each job as it ends, on a terminal a bar with what runs; with -v the
+    warnings of each job too. Exit code 1 where a job failed: its reason stands in the table. A batch that is stopped,
+    by Ctrl-C too, leaves nothing half-written; the same command with --resume goes on.
     """
     from beltrami_cli import study as studies
-    from beltrami_cli.batch import Policy, run, summary_format, write_summary
+    from beltrami_cli.batch import Policy, require_summary, run, write_summary
     from beltrami_cli.config import parse_memory
-    from beltrami_cli.formats import Stage
     from beltrami_cli.memory import available
 
     if resume and overwrite:
         raise click.UsageError("--resume keeps what is done and --overwrite replaces it; give one of them")
     if scheduler is not None and jobs is not None:
         raise click.UsageError("--jobs is for this machine and --scheduler for a cluster; give one of them")
-    study = studies.read_study(configs)
-    if part is not None:
-        study = studies.part(study, part)
     limit = None if memory is None else parse_memory(memory)
     policy = Policy(resume, bool(overwrite), retries, limit, available())
+    whole = studies.read_study(configs)
+    study = whole if part is None else studies.part(whole, part)
+    if summary is not None:
+        require_summary(summary, whole, policy)
+    if not study:
+        say(quiet, f"no jobs in part {part} of {_jobs(len(whole))}")
     if dry_run:
         return _tell_plan(study, policy, quiet)
-    if summary is not None:
-        summary_format(summary)
-        Stage([summary], overwrite=policy.resume or policy.overwrite, inputs=configs)
     announce_compilation(quiet)
     at_once = min(jobs or 1, max(len(study), 1))
     study = _with_threads(study, threads, None if scheduler else at_once)
-    with _workers(scheduler, at_once, study, quiet) as workers, _Progress(len(study), quiet, bool(verbose)) as progress:
-        rows = run(study, workers, policy, settled=progress.settled, watch=progress.watch)
-    _tell_rows(rows, quiet)
-    if summary is not None:
-        write_summary(summary, rows)
+    known: dict[str, Row | None] = {planned.name: None for planned in study}
+    with at_stop(partial(_stopped, known, summary, bool(overwrite))):
+        with (
+            _workers(scheduler, at_once, study, quiet) as workers,
+            _Progress(known, quiet, bool(verbose)) as progress,
+        ):
+            rows = run(study, workers, policy, settled=progress.settled, watch=progress.watch, notify=progress.notify)
+        try:
+            if summary is not None:
+                write_summary(summary, rows)
+        finally:
+            _tell_rows(rows, quiet)
     return 1 if any(row.status == "failed" for row in rows) else 0
+
+
+def _stopped(known: Mapping[str, Row | None], summary: Path | None, overwrite: bool) -> str:
+    """How far a batch is that a signal ends now; the summary of what is settled is written."""
+    from beltrami_cli.batch import write_summary
+
+    rows = [row for row in known.values() if row is not None]
+    if summary is not None:
+        with suppress(Exception):
+            write_summary(summary, rows)
+    failed = sum(row.status == "failed" for row in rows)
+    told = f"{len(rows) - failed} of {_jobs(len(known))} done" + (f", {failed} failed" if failed else "")
+    return f"{told}; the same command with --resume{' in place of --overwrite' if overwrite else ''} goes on"
 
 
 def _with_threads(study: Sequence[Planned], threads: int | None, at_once: int | None) -> list[Planned]:
@@ -138,16 +172,20 @@ def _workers(
 
         return cluster(scheduler, lambda line: note(quiet, line))
     from beltrami_cli.executors import Processes
+    from beltrami_cli.solver import cpus
 
     most = max((planned.job.settings.threads or 1 for planned in study), default=1)
-    return Processes(at_once, most)
+    return Processes(at_once, min(most, cpus()))
 
 
 class _Progress:
-    """What is seen of a batch while it runs: on a terminal a bar with what runs, else a line for each job."""
+    """What is seen of a batch while it runs: on a terminal a bar with what runs, else a line for each job.
 
-    def __init__(self, count: int, quiet: bool, verbose: bool) -> None:
-        self.count, self.quiet, self.verbose, self.bar, self.past = count, quiet, verbose, None, 0
+    known: what became of each job by its name, None until it is settled.
+    """
+
+    def __init__(self, known: dict[str, Row | None], quiet: bool, verbose: bool) -> None:
+        self.known, self.quiet, self.verbose, self.bar = known, quiet, verbose, None
         self.on_terminal = not quiet and sys.stderr.isatty()
 
     def __enter__(self) -> _Progress:
@@ -155,38 +193,58 @@ class _Progress:
             from tqdm import tqdm
 
             # A short bar: what runs needs the room.
-            line = "{n_fmt}/{total_fmt} jobs |{bar:20}| {elapsed}<{remaining}{postfix}"
-            self.bar = tqdm(total=self.count, bar_format=line, leave=False, file=sys.stderr, dynamic_ncols=True)
+            line = "{n_fmt}/{total_fmt} jobs |{bar:10}| {elapsed}<{remaining}{postfix}"
+            self.bar = tqdm(total=len(self.known), bar_format=line, leave=False, file=sys.stderr, dynamic_ncols=True)
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.bar is not None:
-            self.bar.close()
+            with unheard():
+                self.bar.close()
 
     def settled(self, row: Row) -> None:
-        self.past += 1
-        lines = [f"{self.past}/{self.count} {row.job}: {_outcome(row)}"]
+        self.known[row.job] = row
+        past = sum(row is not None for row in self.known.values())
+        lines = [f"{past}/{len(self.known)} {row.job}: {_outcome(row)}"]
         if self.verbose:
-            lines += [f"{row.job}: warning: {warning}" for warning in row.warnings]
-        if self.bar is None:
+            lines += [f"{row.job}: warning: {short(warning)}" for warning in row.warnings]
+        if self.bar is not None:
+            with unheard():
+                self.bar.update()
+        # A bar has counted those that are done already.
+        if row.status == "failed" or (not self.quiet and (self.bar is None or self.verbose)):
             for line in lines:
-                note(self.quiet and row.status != "failed", line)
-            return
-        self.bar.update()
-        for line in lines if row.status == "failed" else lines[1:]:
-            self.bar.write(f"beltrami: {line}", file=sys.stderr)
+                self._tell(line)
+
+    def notify(self, line: str) -> None:
+        if not self.quiet:
+            self._tell(line)
 
     def watch(self, running: list[Running]) -> None:
         if self.bar is None:
             return
-        shown = [f"{one.planned.name}: {one.phase or 'starting'}" for one in running[:MOST_SHOWN]]
+        shown = [f"{_values(one.planned.name)}: {one.phase or 'starting'}" for one in running[:MOST_SHOWN]]
         more = f" and {len(running) - len(shown)} more" if len(running) > len(shown) else ""
-        self.bar.set_postfix_str("; ".join(shown) + more)
+        with unheard():
+            self.bar.set_postfix_str("; ".join(shown) + more)
+
+    def _tell(self, line: str) -> None:
+        if self.bar is None:
+            note(False, line)
+        else:
+            with unheard():
+                self.bar.write(f"beltrami: {line}", file=sys.stderr)
+
+
+def _values(name: str) -> str:
+    """The name of a job without the names in it: "01 lh" of "subject=01 hemi=lh"."""
+    return re.sub(r"(^| )\w+=", r"\1", name)
 
 
 def _outcome(row: Row) -> str:
-    seconds = "" if row.seconds is None else f", {row.seconds:.1f} s"
-    return f"{row.status}{seconds}" if row.status != "failed" else f"failed: {short(row.reason)}"
+    if row.status == "failed":
+        return f"failed: {short(row.reason)}"
+    return f"done, {row.seconds:.1f} s" if row.status == "done" and row.seconds is not None else row.status
 
 
 def _tell_plan(study: Sequence[Planned], policy: Policy, quiet: bool) -> int:
@@ -195,32 +253,45 @@ def _tell_plan(study: Sequence[Planned], policy: Policy, quiet: bool) -> int:
     from beltrami_cli.memory import told
 
     plans = [foresee(planned, policy) for planned in study]
-    cells = [("job", "plan", "memory", "output", "")]
+    cells = [("job", "plan", "memory", "output")]
     for planned, plan in zip(study, plans, strict=True):
         memory = "" if plan.memory is None else told(plan.memory)
-        cells.append((planned.name, plan.what, memory, short(str(planned.job.volume)), short(plan.reason)))
-    _tell_table(cells, quiet)
+        cells.append((planned.name, plan.what, memory, short(str(planned.job.volume))))
+    _tell_table(cells, [plan.reason for plan in plans], quiet)
     counts = Counter(plan.what for plan in plans)
-    say(quiet, f"{len(study)} jobs: " + ", ".join(f"{number} to {what}" for what, number in counts.items()))
+    _tell_sums(len(study), [f"{number} to {what}" for what, number in counts.items()], quiet)
     return 1 if counts["fail"] else 0
 
 
 def _tell_rows(rows: Sequence[Row], quiet: bool) -> None:
     """Print the final table and its sums."""
-    cells: list[tuple[str, ...]] = [("job", "status", "seconds", "noise before", "after", "stopped by", "")]
+    cells: list[tuple[str, ...]] = [("job", "status", "seconds", "noise before", "after", "stopped by")]
     for row in rows:
         seconds = "" if row.seconds is None else f"{row.seconds:.1f}"
         noise = tuple("" if sd is None else f"{sd:.4g}" for sd in (row.noise_before, row.noise_after))
-        cells.append((row.job, row.status, seconds, *noise, row.stop_reason or "", short(row.reason)))
-    _tell_table(cells, quiet)
+        cells.append((row.job, row.status, seconds, *noise, row.stop_reason or ""))
+    _tell_table(cells, [row.reason for row in rows], quiet)
     counts = Counter(row.status for row in rows)
     warned = sum(bool(row.warnings) for row in rows)
-    told = ", ".join(f"{number} {status}" for status, number in sorted(counts.items()))
-    say(quiet, f"{len(rows)} jobs: {told}" + (f"; {warned} with warnings, see their records (-v)" if warned else ""))
+    told = [f"{number} {status}" for status, number in sorted(counts.items())]
+    _tell_sums(len(rows), told, quiet, f"; {warned} with warnings, see their records, or -v" if warned else "")
 
 
-def _tell_table(cells: Sequence[tuple[str, ...]], quiet: bool) -> None:
-    """Print rows in aligned columns, the last as long as it is."""
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
-        say(quiet, "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+def _tell_table(cells: Sequence[tuple[str, ...]], reasons: Sequence[str], quiet: bool) -> None:
+    """Print rows below their head in aligned columns, those that are not empty, and each one's reason below it."""
+    widths = [max(map(len, column)) if any(column[1:]) else 0 for column in zip(*cells, strict=True)]
+    for row, reason in zip(cells, ["", *reasons], strict=True):
+        shown = [cell.ljust(width) for cell, width in zip(row, widths, strict=True) if width]
+        if shown:
+            say(quiet, "  ".join(shown).rstrip())
+        if reason:
+            say(quiet, f"    {short(reason)}")
+
+
+def _tell_sums(count: int, parts: Sequence[str], quiet: bool, more: str = "") -> None:
+    if count:
+        say(quiet, f"{_jobs(count)}: {', '.join(parts)}{more}")
+
+
+def _jobs(count: int) -> str:
+    return "1 job" if count == 1 else f"{count} jobs"

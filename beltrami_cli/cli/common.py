@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 import traceback
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
 
 import click
 
-from beltrami_cli.errors import BeltramiError
+from beltrami_cli.errors import BeltramiError, DataError
+
+# What commands that are running have to say where a signal ends them.
+_LAST_WORDS: list[Callable[[], str]] = []
 
 
 class Command(click.Command):
@@ -34,33 +41,77 @@ class Command(click.Command):
 def report_error(error: Exception, *, verbose: bool) -> int:
     """Print the error as one line (the whole traceback too, if verbose) and return its exit code."""
     if verbose:
-        click.echo("".join(traceback.format_exception(error)).rstrip(), err=True)
+        _tell("".join(traceback.format_exception(error)).rstrip())
     if isinstance(error, BeltramiError):
-        click.echo(f"beltrami: {error}", err=True)
+        _tell(f"beltrami: {short(str(error))}")
         return error.exit_code
     if isinstance(error, MemoryError):
-        click.echo("beltrami: out of memory; use a smaller --band, or crop the volumes to the surface", err=True)
+        _tell("beltrami: out of memory; use a smaller --band, or crop the volumes to the surface")
         return 1
     line = " ".join(str(error).split()) or "no message"
-    click.echo(f"beltrami: unexpected {type(error).__name__}: {line}; -v shows where (please report it)", err=True)
+    _tell(f"beltrami: unexpected {type(error).__name__}: {line}; -v shows where (please report it)")
     return 1
 
 
 def say(quiet: bool, line: str) -> None:
-    """A line of result on stdout, unless quiet."""
-    if not quiet:
+    """A line of result on stdout, unless quiet; raises DataError where it cannot be written."""
+    if quiet:
+        return
+    try:
         click.echo(line)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        silence("stdout")
+        raise DataError(f"stdout: cannot be written to ({error.strerror}); check the disk") from error
 
 
 def note(quiet: bool, line: str) -> None:
     """A line about the run on stderr, unless quiet."""
     if not quiet:
-        click.echo(f"beltrami: {line}", err=True)
+        _tell(f"beltrami: {line}")
+
+
+def _tell(line: str) -> None:
+    with unheard():
+        click.echo(line, err=True)
+
+
+@contextmanager
+def unheard() -> Iterator[None]:
+    """For what is told on stderr: where that is broken nobody is told any more, and the work goes on."""
+    try:
+        yield
+    except OSError:
+        silence("stderr")
+
+
+def silence(name: Literal["stdout", "stderr"]) -> None:
+    """Say nothing more there: what a broken stream still holds would fail again when the process ends."""
+    setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+
+
+@contextmanager
+def at_stop(word: Callable[[], str]) -> Iterator[None]:
+    """Where a signal ends the process in this block, `word` is called, and what it gives is told."""
+    _LAST_WORDS.append(word)
+    try:
+        yield
+    finally:
+        _LAST_WORDS.remove(word)
+
+
+def last_words() -> list[str]:
+    return [word() for word in _LAST_WORDS]
 
 
 def short(text: str) -> str:
     """Paths in the working folder as seen from there."""
-    return text.replace(os.getcwd() + os.sep, "")
+    try:
+        here = re.escape(os.getcwd() + os.sep)
+    except OSError:  # it has been removed
+        return text
+    return re.sub(rf"""(?<![^\s"'(\[=:]){here}""", "", text)  # not from the middle of a longer path
 
 
 def announce_compilation(quiet: bool) -> None:

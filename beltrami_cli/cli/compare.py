@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,6 +97,8 @@ def _are_folders(a: Path, b: Path) -> bool:
     if a.is_dir() and b.is_dir():
         return True
     for path, other in ((a, b), (b, a)):
+        if not os.path.lexists(path):
+            raise RefusedError(f"{path}: no such file or folder; check the path")
         if path.is_dir() and other.exists():
             raise RefusedError(f"{path} is a folder, {other} is none; expected two files or two folders")
         if not path.is_dir():

@@ -1,9 +1,16 @@
 """Numba functions on flat arrays and floats; compiled on first use and cached on disk."""
 
+import os
 from pathlib import Path
 
 import numba as nb
 import numpy as np
+
+# How often GNU's OpenMP, where numba uses it, looks for the next loop before its threads sleep: about 10 microseconds.
+# Its own 300,000 make a small run take up to 100 times as long where other programs want the CPUs too; with this an
+# idle machine is as fast as before. Read when the first parallel kernel runs.
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 # Entries worked on at a time: their arrays stay in a core's cache, and sums over blocks of one size do not depend on
 # the number of threads.

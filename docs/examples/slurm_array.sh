@@ -4,7 +4,9 @@
 #SBATCH --cpus-per-task=4
 #SBATCH --mem=16G
 #SBATCH --time=04:00:00
-#SBATCH --output=slurm_logs/%A_%a.out
+#SBATCH --output=%x_%A_%a.out
 
 # Task K of N does every N-th job of the study, from the K-th. Submitted again it does what is not done yet.
-beltrami batch "$@" --resume --part "$SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT" --threads "$SLURM_CPUS_PER_TASK"
+# For summaries add one for each task: --summary "part-$SLURM_ARRAY_TASK_ID.csv".
+beltrami batch "$@" --resume --part "$SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT" \
+  --threads "${SLURM_CPUS_PER_TASK:-1}"
