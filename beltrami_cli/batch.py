@@ -436,7 +436,7 @@ def write_summary(path: Path, rows: Sequence[Row]) -> None:
     text = _as_csv(rows) if _summary_format(path) == "csv" else _as_json(rows)
     _make_folder(path.parent)
     with formats.Stage([path], overwrite=True) as stage, formats.writing(path):
-        stage.path(path).write_text(text, encoding="utf-8", newline="")
+        stage.path(path).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
         stage.commit()
 
 

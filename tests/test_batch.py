@@ -742,3 +742,18 @@ def test_a_record_without_figures_is_no_record(tmp_path, study):
     sidecar.write_text(json.dumps(record))
     assert statuses(batch.run(study[:1], Here(), Policy(resume=True))) == ["done"]
     assert "Seconds" in json.loads(sidecar.read_text())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names that are no text")
+def test_files_whose_names_are_no_text(tmp_path, monkeypatch):
+    write_study(tmp_path, 1)
+    (tmp_path / "data-1.nii.gz").rename(os.fsdecode(bytes(tmp_path) + b"/sub-\xff.nii.gz"))
+    config = tmp_path / "odd.toml"
+    config.write_text(
+        '[for_each]\ndata = "sub-{s}.nii.gz"\n[input]\nlevelset = "psi.nii.gz"\ndata = "{data}"\n'
+        '[output]\nvolume = "out/{s}.nii.gz"\n[flow]\nbeta = 0.1\n[time]\niterations = 1\n'
+    )
+    monkeypatch.setattr(executors, "Processes", lambda *_: Here())
+    run = beltrami("batch", config, "--summary", tmp_path / "odd.csv")
+    assert (run.code, run.out.count("done")) == (0, 2)
+    assert "s=\\udcff" in run.out and "s=\\udcff" in (tmp_path / "odd.csv").read_text()

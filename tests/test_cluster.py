@@ -325,14 +325,17 @@ def test_dask_example_runs_with_workers_of_this_machine(tmp_path, study):
     assert run.stdout.count("skipped") == 5
 
 
-def test_dask_example_asks_slurm_for_what_it_says():
+def test_dask_example_asks_slurm_for_what_it_says(tmp_path):
     """In a process of its own: the scheduler that SLURM's workers are to find runs in it."""
     code = """if True:
         import slurm_dask
         with slurm_dask.slurm(1.5, 6, "20GB") as cluster:
             print(cluster.job_script())
     """
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=EXAMPLES, timeout=60)
+    here = {**os.environ, "PYTHONPATH": str(EXAMPLES)}  # logs are kept in the working folder
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=here, timeout=60
+    )
     script = run.stdout
     assert re.search(r"^#SBATCH -n 1$", script, re.MULTILINE), run.stderr
     assert re.search(r"^#SBATCH --cpus-per-task=6$", script, re.MULTILINE)

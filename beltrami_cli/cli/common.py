@@ -58,7 +58,7 @@ def say(quiet: bool, line: str) -> None:
     if quiet:
         return
     try:
-        click.echo(line)
+        click.echo(_printable(line))
     except BrokenPipeError:
         raise
     except OSError as error:
@@ -74,7 +74,12 @@ def note(quiet: bool, line: str) -> None:
 
 def _tell(line: str) -> None:
     with unheard():
-        click.echo(line, err=True)
+        click.echo(_printable(line), err=True)
+
+
+def _printable(line: str) -> str:
+    """The line with names that are no text, as files may have them, spelt out."""
+    return line.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 @contextmanager
