@@ -12,8 +12,8 @@ help:  ## list the targets
 demo: $(VENV)/.installed-demo  ## denoise a small surface: picture and mesh in demo_out/
 	$(BIN)/beltrami demo demo_out --from sample_data/torus --overwrite
 
-test: $(VENV)/.installed-dev  ## run the tests
-	$(BIN)/python -m pytest
+test: $(VENV)/.installed-dev  ## run the tests, in as many processes as there are cores
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
 lint: $(VENV)/.installed-dev  ## check format, style, types and the import contracts
 	$(BIN)/ruff check .

@@ -14,17 +14,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from queue import SimpleQueue
 from typing import Any
 
 # How many threads a library starts, read when it is loaded: numba, libigl, and what stands behind NumPy and SciPy.
 _THREADS = ("NUMBA_NUM_THREADS", "IGL_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# File descriptors that a process costs the one that started it, as measured, and those that one has open otherwise.
+_FILES, _OWN_FILES = 8, 100
 # Seconds in which a worker whose batch is gone leaves compiled code, where signals wait.
 _LAST_CALL = 2
 # Signals that end a worker.
-_ENDING = (signal.SIGINT, signal.SIGTERM)
+_ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 # Held by the job that this process does: a Dask worker of several threads would start several.
 alone = threading.Lock()
@@ -56,46 +58,68 @@ class Processes(Workers):
             # It clears up behind this process where that is stopped at once, and would print warnings that it had to.
             with _environment({"PYTHONWARNINGS": "ignore:resource_tracker"}):
                 resource_tracker.ensure_running()
-        self._idle: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
+            _allow_files(count * _FILES + _OWN_FILES)
+        self._idle: SimpleQueue[ProcessPoolExecutor | None] = SimpleQueue()  # None: to be made when it is needed
         for _ in range(count):
-            self._idle.put(self._fresh())
+            self._idle.put(None)
 
     def slots(self) -> int:
         return self._count
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """As Executor.submit; waits while every process is at work."""
+        """As Executor.submit; waits while every process is at work. Raises OSError where none can be started."""
         pool = self._idle.get()
-        with _environment({name: str(self._threads) for name in _THREADS}), _signals_held():
-            try:
-                future = pool.submit(fn, *args, **kwargs)
-            except BrokenExecutor:  # killed while it was idle
-                pool = self._fresh()
-                future = pool.submit(fn, *args, **kwargs)
-        future.add_done_callback(lambda done: self._idle.put(self._fresh() if _is_broken(done) else pool))
+        try:
+            with _environment({name: str(self._threads) for name in _THREADS}), _signals_held():
+                pool = pool or _fresh()
+                try:
+                    future = pool.submit(fn, *args, **kwargs)
+                except BrokenExecutor:  # killed while it was idle
+                    pool = _fresh()
+                    future = pool.submit(fn, *args, **kwargs)
+        except BaseException:
+            self._idle.put(None)
+            raise
+        future.add_done_callback(lambda done: self._idle.put(None if _is_broken(done) else pool))
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         while not self._idle.empty():
-            self._idle.get().shutdown(wait, cancel_futures=cancel_futures)
-
-    def _fresh(self) -> ProcessPoolExecutor:
-        # Started anew, not forked: a fork would take over threads' locks without the threads.
-        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_become_worker)
+            pool = self._idle.get()
+            if pool is not None:
+                pool.shutdown(wait, cancel_futures=cancel_futures)
 
 
 def deaths(error: BaseException) -> int:
     """How many processes were lost at a job that ended with this error; 0 where the error is one of its own."""
-    if isinstance(error, BrokenExecutor | CancelledError):
+    if isinstance(error, BrokenExecutor | CancelledError | OSError):  # the last: it could not be started
         return 1
     # Dask's KilledWorker: its scheduler starts a job again where a worker died, so many times, before it gives up.
     return 1 + error.allowed_failures if hasattr(error, "allowed_failures") else 0
 
 
+def _fresh() -> ProcessPoolExecutor:
+    # Started anew, not forked: a fork would take over threads' locks without the threads.
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_become_worker)
+
+
+def _allow_files(count: int) -> None:
+    """Let this process have so many files open, as far as the system lets it: a POSIX one."""
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY:
+        count = min(count, hard)
+    if soft != resource.RLIM_INFINITY and soft < count:
+        with suppress(ValueError, OSError):  # macOS has a limit beside the hard one
+            resource.setrlimit(resource.RLIMIT_NOFILE, (count, hard))
+
+
 def _become_worker() -> None:
-    """End with the process that started this one: on its signals, and when it is gone."""
+    """End with the process that started this one: on its signals, but for those it ignores, and when it is gone."""
     for number in _ENDING:
-        signal.signal(number, _end_on_signal)
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _end_on_signal)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
     threading.Thread(target=_end_with_parent, daemon=True).start()

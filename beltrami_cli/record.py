@@ -195,10 +195,10 @@ def request(job: Job) -> dict[str, Any]:
     JSON-ready; files by their place relative to the sidecar, so that a study can move. What a machine has to give,
     threads and memory, is left out: outputs do not depend on it.
     """
-    folder = sidecar_of(job.volume).parent
+    folder = plain(sidecar_of(job.volume)).parent
 
     def place(path: Path | None) -> str | None:
-        return None if path is None else Path(os.path.relpath(path, folder)).as_posix()
+        return None if path is None else seen_from(folder, plain(path)).as_posix()
 
     settings = {name: value for name, value in asdict(job.settings).items() if name != "threads"}
     asked = {
@@ -226,14 +226,34 @@ def provenance(
     return {
         "GeneratedBy": [{"Name": "beltrami_cli", "Version": __version__}],
         "Sources": [
-            {"Path": os.path.abspath(path), "SHA256": digest} | ({"Role": role} if role else {})
+            {"Path": str(plain(path)), "SHA256": digest} | ({"Role": role} if role else {})
             for path, digest, role in sources
         ],
-        "Outputs": [os.path.abspath(file) for file in outputs],
+        "Outputs": [str(plain(file)) for file in outputs],
         "Created": datetime.now(UTC).isoformat(timespec="seconds"),
         "Parameters": dict(parameters),
         "Warnings": list(warnings),
     }
+
+
+def plain(path: Path) -> Path:
+    """The absolute path without `..`; links stay, but where `..` follows one: that leads to where the link points."""
+    here, *steps = path.absolute().parts
+    found = Path(here)
+    for step in steps:
+        if step != "..":
+            found /= step
+        else:
+            found = (found.resolve() if found.is_symlink() else found).parent
+    return found
+
+
+def seen_from(folder: Path, path: Path) -> Path:
+    """A plain path relative to a plain folder, so that both can move; absolute on another drive (of Windows)."""
+    try:
+        return Path(os.path.relpath(path, folder))
+    except ValueError:
+        return path
 
 
 def sidecar_of(output: Path) -> Path:

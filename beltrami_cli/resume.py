@@ -10,7 +10,7 @@ from typing import Any
 
 from beltrami_cli import __version__
 from beltrami_cli.config import Job
-from beltrami_cli.record import request, sha256, sidecar_of, sources_of
+from beltrami_cli.record import plain, request, seen_from, sha256, sidecar_of, sources_of
 
 # Of a record, what a batch tells of its job.
 _FIGURES = {"Noise", "Seconds", "Iterations", "StopReason", "Warnings"}
@@ -42,5 +42,7 @@ def finished(job: Job) -> dict[str, Any] | None:
 
 def outputs_of(record: Mapping[str, Any], sidecar: Path) -> list[Path]:
     """Where the files are that a record tells of: beside its sidecar, if the study has moved since."""
-    *_, then = record["Outputs"]
-    return [sidecar.parent / os.path.relpath(output, os.path.dirname(then)) for output in record["Outputs"]]
+    outputs = [Path(output) for output in record["Outputs"]]
+    then, now = outputs[-1].parent, plain(sidecar).parent
+    # By name alone, as the record's paths are: the system would go through a link first, and up from where that leads.
+    return [Path(os.path.normpath(now / seen_from(then, output))) for output in outputs]

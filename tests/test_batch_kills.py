@@ -23,7 +23,7 @@ from command import ball, contents, nifti, record
 from studies import Here, batch, digest, essence, finish, members, small_disk, start, wait_for, write_study
 
 from beltrami_cli import formats, kernels
-from beltrami_cli.batch import Policy, run
+from beltrami_cli.batch import Policy, Row, run
 from beltrami_cli.errors import DataError
 from beltrami_cli.formats.staging import who_writes
 from beltrami_cli.grid import Grid, Volume
@@ -251,7 +251,7 @@ def test_a_job_whose_process_dies_is_tried_again_and_reported_where_it_always_di
 def test_stopped_it_ends_at_once_with_its_workers_and_leaves_nothing_half_done(tmp_path):
     config, out = write_study(tmp_path, 12, size=36, iterations=60), tmp_path / "out"
     for pattern, number, code, line in (
-        (".*.partial", signal.SIGINT, 130, "\n"),
+        (".*.partial/.running", signal.SIGINT, 130, "\n"),
         ("*.json", signal.SIGINT, 130, "\n"),
         ("*.json", signal.SIGTERM, 143, ""),
         ("*.json", signal.SIGHUP, 129, ""),
@@ -370,7 +370,7 @@ def pages(folder: Path) -> int:
 def test_a_summary_that_finds_no_room_is_told_behind_the_table(tmp_path):
     with small_disk(tmp_path / "disk", "1m") as disk:
         config, summary = write_study(tmp_path, 2), disk / "study.csv"
-        summary.write_text("old\n")
+        summary.write_text(old := ",".join(Row.__dataclass_fields__) + "\n")
         fill(disk, 0)
         out, err = batch(config, "--overwrite", "--summary", summary, code=1)
         assert "2 jobs: 2 done" in out
@@ -378,7 +378,7 @@ def test_a_summary_that_finds_no_room_is_told_behind_the_table(tmp_path):
             "beltrami: study.csv: cannot be written (No space left on device); check the disk and its quota"
         )
         assert set(contents(disk)) == {"ballast", "study.csv"}
-        assert summary.read_text() == "old\n"
+        assert summary.read_text() == old
 
 
 def test_a_folder_that_cannot_be_used_is_told_and_the_others_are_done(tmp_path):

@@ -317,6 +317,12 @@ def test_stem(name, expected):
     assert stem(Path(name)) == Path(expected)
 
 
+@pytest.mark.parametrize("name", [".", "..", "..nii", "..nii.gz", "a/...nii.gz", "a/..npy", ""])
+def test_a_name_of_dots_has_no_stem(name):
+    with pytest.raises(RefusedError, match="no name of a file"):
+        stem(Path(name))
+
+
 @pytest.mark.parametrize(
     ("name", "files"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,6 +104,53 @@ def test_a_study_may_move(job, ran):
     assert finished(job) is not None
     (job.volume.parent / "out.surf.gii").unlink()
     assert finished(job) is None
+
+
+def run_in(folder, volume, mesh):
+    """The job of such a study in the folder, done."""
+    psi, data = nifti(folder / "psi.nii.gz", ball()), nifti(folder / "data.nii.gz", noisy())
+    files = {"levelset": psi, "data": data, "volume": folder / volume, "mesh": (folder / mesh,)}
+    done("denoise", psi, data, "-o", folder / volume, "--mesh", folder / mesh, "--iterations", 1, "--beta", 0.1, "-q")
+    return make_job({**files, "beta": 0.1, "iterations": 1})
+
+
+def test_outputs_behind_a_link_are_found_also_where_the_study_moved(tmp_path):
+    study, disk = tmp_path / "study", tmp_path / "disk" / "big"
+    for folder in (study / "mesh", disk):
+        folder.mkdir(parents=True)
+    (study / "out").symlink_to(disk)
+    job = run_in(study, "out/o.nii.gz", "mesh/o.ply")
+    assert finished(job) is not None
+
+    moved = study.rename(tmp_path / "moved")
+    there = {name: moved / getattr(job, name).relative_to(study) for name in ("levelset", "data", "volume")}
+    job = replace(job, **there, mesh=(moved / "mesh" / "o.ply",))
+    assert finished(job) is not None
+    (moved / "mesh" / "o.ply").unlink()
+    assert finished(job) is None
+
+
+def test_up_from_a_link_is_up_from_where_it_leads(tmp_path):
+    study, disk = tmp_path / "study", tmp_path / "disk"
+    for folder in (study / "mesh", disk / "big", disk / "out"):
+        folder.mkdir(parents=True)
+    (study / "link").symlink_to(disk / "big")
+    job = run_in(study, "link/../out/o.nii.gz", "mesh/../o.ply")
+    written = record(disk / "out" / "o.json")
+    assert written["Outputs"] == [str(disk / "out" / "o.nii.gz"), str(study / "o.ply"), str(disk / "out" / "o.json")]
+    assert written["Request"]["mesh"] == ["../../study/o.ply"]
+    assert finished(job) is not None
+    # The same names without the link are other files.
+    assert finished(replace(job, volume=study / "out" / "o.nii.gz")) is None
+
+
+def test_places_on_two_drives(monkeypatch, job):
+    def relpath(path, start):
+        raise ValueError("path is on mount 'C:', start on mount 'D:'")
+
+    monkeypatch.setattr("os.path.relpath", relpath)
+    assert resume.request(job)["volume"] == job.volume.as_posix()
+    assert resume.outputs_of({"Outputs": [str(job.volume), "/d/o.json"]}, job.volume) == [job.volume, Path("/d/o.json")]
 
 
 def test_a_missing_input_is_told(job):

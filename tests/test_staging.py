@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import socket
 import subprocess
 import sys
@@ -10,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from beltrami_cli.errors import BusyError, DataError, RefusedError
-from beltrami_cli.formats import Stage
+from beltrami_cli.formats import Stage, staging
 from beltrami_cli.formats.staging import who_writes
 
 
@@ -66,9 +68,9 @@ def test_a_killed_run_leaves_no_output_and_the_next_one_clears_up(tmp_path):
     assert everything_in(tmp_path) == {"o.nii.gz"}
 
 
-def writing_elsewhere(*finals: Path) -> subprocess.Popen[str]:
-    """A process that has entered a stage for these files, and stays in it until it is killed."""
-    program = (
+def writing_elsewhere(*finals: Path, first: str = "") -> subprocess.Popen[str]:
+    """A process that has entered a stage for these files, and stays in it until it is killed. first: lines it runs."""
+    program = first + (
         "import sys, time; from pathlib import Path; from beltrami_cli.formats import Stage\n"
         "with Stage([Path(p) for p in sys.argv[1:]]) as stage:\n"
         "    stage.path(Path(sys.argv[1])).write_text('half'); stage.tell('flow')\n"
@@ -165,6 +167,86 @@ def test_many_runs_at_once_enter_one_by_one(tmp_path):
     runs = [subprocess.Popen([sys.executable, "-c", program, str(tmp_path / "o"), str(k)]) for k in range(4)]
     assert [run.wait(60) for run in runs] == [0] * 4
     assert everything_in(tmp_path) == {"o"}
+
+
+@pytest.fixture
+def flock_fails(monkeypatch):
+    """Lets every lock of a file end with an error of this number, here."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def fails(number: int) -> None:
+        def flock(*_: object) -> None:
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(fcntl, "flock", flock)
+
+    return fails
+
+
+@pytest.mark.parametrize("code", ["ENOLCK", "ENOTSUP", "EOPNOTSUPP", "ENOSYS"])
+def test_where_there_are_no_locks_a_file_stands_for_one(tmp_path, flock_fails, code):
+    flock_fails(getattr(errno, code))
+    final = tmp_path / "o"
+    with Stage([final]) as first:
+        first.path(final).write_text("first")
+        with pytest.raises(BusyError, match=rf"another run is writing it \(process {os.getpid()} on "), Stage([final]):
+            pass
+        first.commit()
+    assert everything_in(tmp_path) == {"o"}
+
+
+def test_what_a_killed_run_left_is_taken_over_where_there_are_no_locks(tmp_path, flock_fails):
+    flock_fails(errno.ENOLCK)
+    no_locks = (
+        "import errno, fcntl\ndef flock(*_): raise OSError(errno.ENOLCK, 'No locks available')\nfcntl.flock = flock\n"
+    )
+    with writing_elsewhere(tmp_path / "o", first=no_locks) as other:
+        with pytest.raises(BusyError, match=f"process {other.pid} on "), Stage([tmp_path / "o"]):
+            pass
+        other.kill()
+    with Stage([tmp_path / "o"]) as stage:
+        assert not stage.path(tmp_path / "o").exists()
+    assert everything_in(tmp_path) == set()
+
+
+def test_a_lock_that_fails_leaves_nothing(tmp_path, flock_fails):
+    flock_fails(errno.EIO)
+    with pytest.raises(RefusedError, match=r"cannot be written to \(Input/output error\)"), Stage([tmp_path / "o"]):
+        pass
+    assert everything_in(tmp_path) == set()
+
+
+@pytest.mark.parametrize("stands_there", ["file", "link", "pipe"])
+def test_what_stands_in_the_way_of_the_hidden_folder_is_told(tmp_path, stands_there):
+    hidden = tmp_path / ".o.partial"
+    match stands_there:
+        case "file":
+            hidden.touch()
+        case "link":
+            hidden.symlink_to("nowhere")
+        case "pipe":
+            os.mkfifo(hidden)
+    with pytest.raises(RefusedError, match=r"\.o\.partial: cannot be made; remove what"), Stage([tmp_path / "o"]):
+        pass
+    assert everything_in(tmp_path) == {".o.partial"}
+
+
+def test_a_process_that_ends_between_two_steps_leaves_no_hidden_folder(tmp_path, monkeypatch):
+    def ends(folder: Path) -> None:
+        assert folder.is_dir()
+        staging.abandon()
+        assert everything_in(tmp_path) == set()
+        raise KeyboardInterrupt
+
+    with Stage([tmp_path / "o"]):
+        (lock,) = staging._OPEN.values()
+        monkeypatch.setattr(lock, "release", staging.abandon)
+    assert everything_in(tmp_path) == set()
+    assert not staging._OPEN
+    assert not staging._MADE
+    monkeypatch.setattr(staging, "_locked", ends)
+    with pytest.raises(KeyboardInterrupt), Stage([tmp_path / "o"]):
+        pass
 
 
 def test_an_existing_output_needs_overwrite(tmp_path):

@@ -108,12 +108,18 @@ def is_npy(path: Path) -> bool:
 
 
 def stem(path: Path) -> Path:
-    """The path without its format suffix: o.nii.gz -> o, o.func.gii -> o.func, lh.map (FreeSurfer's) -> lh.map."""
+    """The path without its format suffix: o.nii.gz -> o, o.func.gii -> o.func, lh.map (FreeSurfer's) -> lh.map.
+
+    Raises RefusedError where nothing is left but dots, which name folders.
+    """
     path = Path(path)
     if freesurfer.is_name(path) and path.name[:3].lower() in ("lh.", "rh."):
         return path
     suffix = ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix
-    return path.with_name(path.name[: len(path.name) - len(suffix)])
+    name = path.name[: len(path.name) - len(suffix)]
+    if not name.strip("."):
+        raise RefusedError(f"{path}: no name of a file; expected one with more than dots before its suffix")
+    return path.with_name(name)
 
 
 def read_grid(
@@ -270,11 +276,9 @@ def mesh_beside(path: Path, *, curve: bool = False) -> Path:
 
     For vertex data too: o.func.gii -> o.surf.gii, lh.map -> lh.map.surf.gii.
     """
-    base = stem(path)
-    if base.suffix in (".func", ".shape"):
-        base = base.with_suffix("")
+    name = stem(path).name.removesuffix(".func").removesuffix(".shape")
     plain = curve or Path(path).suffix.lower() in (".mha", ".mhd", ".npy")
-    return base.with_name(base.name + (".ply" if plain else ".surf.gii"))
+    return Path(path).with_name(name + (".ply" if plain else ".surf.gii"))
 
 
 def mesh_files(path: Path, *, values: bool = True, curve: bool = False) -> list[Path]:

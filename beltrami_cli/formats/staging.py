@@ -7,6 +7,7 @@ that is.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -20,8 +21,12 @@ from typing import Any
 
 from beltrami_cli.errors import BusyError, DataError, RefusedError
 
-# In a hidden folder: the lock, and who holds it.
-_LOCK, _WHO = ".lock", ".running"
+# In a hidden folder: the lock, the file that stands for it where there are no locks, and who holds it.
+_LOCK, _STAND_IN, _WHO = ".lock", ".held", ".running"
+# How a file system says that it has no locks: NFS without its lock service, FUSE and SMB.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)
+# How often the owner of a hidden folder may remove it between two steps of the one who wants it next.
+_TRIES = 1000
 # Bytes of what is told, padded, so that a shorter phase covers a longer one.
 _LINE = 400
 # Seconds within which a lock that is about to be given up can be had: its owner only removes some files meanwhile.
@@ -29,12 +34,16 @@ _PATIENCE = 0.2
 
 # The hidden folders of stages that are entered, with their locks.
 _OPEN: dict[Path, Any] = {}
+# Those, and others that may stand empty for a moment, before they are locked and after.
+_MADE: set[Path] = set()
 
 
 def abandon() -> None:
     """Leave no trace of what is being written: for a process that is about to end."""
     for folder in list(_OPEN):
         _give_up(folder)
+    for folder in list(_MADE):
+        _remove(folder)
 
 
 def who_writes(mark: Path) -> dict[str, Any] | None:
@@ -163,21 +172,18 @@ def _claim(folder: Path, final: Path) -> None:
 
     Raises BusyError where a living run holds it, RefusedError where it cannot be made.
     """
-    from filelock import FileLock, Timeout
+    from filelock import Timeout
 
-    while True:
+    _MADE.add(folder)
+    for _ in range(_TRIES):
+        made = not folder.exists()
         try:
             folder.mkdir(exist_ok=True)
-            lock = FileLock(folder / _LOCK, timeout=_PATIENCE, thread_local=False)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that a file system without locks gets a file in their place
-                lock.acquire()
+            _OPEN[folder] = _locked(folder)
+            return
         except (FileNotFoundError, FileExistsError):  # its last owner removed the folder just now
-            if folder.parent.is_dir() and not folder.is_file():
-                continue
-            raise RefusedError(
-                f"{folder}: cannot be made; remove what stands there, or choose another folder"
-            ) from None
+            if folder.is_symlink() or folder.is_file():
+                break
         except Timeout:
             who = who_writes(final) or {}
             name = f"process {who['process']} on {who['host']}" if who else "of another process"
@@ -186,30 +192,53 @@ def _claim(folder: Path, final: Path) -> None:
             ) from None
         except OSError as error:
             with suppress(OSError):
-                folder.rmdir()
+                if made:
+                    (folder / _LOCK).unlink()
+            _remove(folder)
             raise RefusedError(
                 f"{folder.parent}: cannot be written to ({error.strerror}); choose another folder for the output"
             ) from error
-        _OPEN[folder] = lock
-        return
+    raise RefusedError(f"{folder}: cannot be made; remove what stands there, or choose another folder")
+
+
+def _locked(folder: Path) -> Any:
+    """The lock of a hidden folder, held; raises filelock's Timeout where another holds it, else OSError."""
+    from filelock import FileLock, SoftFileLock
+
+    lock = FileLock(folder / _LOCK, timeout=_PATIENCE, thread_local=False)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that a system without locks gets a file in their place
+            lock.acquire()
+    except OSError as error:  # no Timeout, which has no number
+        if error.errno not in _NO_LOCKS:
+            raise
+        lock = SoftFileLock(folder / _STAND_IN, timeout=_PATIENCE, thread_local=False)
+        lock.acquire()
+    return lock
 
 
 def _give_up(folder: Path) -> None:
     """Remove a hidden folder whose lock this process holds, the lock last."""
     _empty(folder)
-    lock = _OPEN.pop(folder)  # not before: `abandon` may come in between
     with suppress(OSError):  # where an open file cannot be removed, the next run takes the folder over
         (folder / _LOCK).unlink()
-    lock.release()
-    with suppress(OSError):  # another run may be in it already
+    _OPEN.pop(folder).release()  # not before: `abandon` may come in between
+    _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a hidden folder that is empty: where it is not, another run is in it already."""
+    with suppress(OSError):
         folder.rmdir()
+    _MADE.discard(folder)
 
 
 def _empty(folder: Path) -> None:
     for path in list(folder.iterdir()) if folder.is_dir() else []:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
-        elif path.name != _LOCK:
+        elif path.name not in (_LOCK, _STAND_IN):
             with suppress(OSError):
                 path.unlink()
 
