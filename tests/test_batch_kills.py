@@ -262,11 +262,12 @@ def test_stopped_it_ends_at_once_with_its_workers_and_leaves_nothing_half_done(t
         (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
         _, err = finish(process, code, timeout=5)
         said = re.sub(r"beltrami: \d+/12 .*: (done, .* s|skipped)\n", "", err)
-        settled = err.count("\n") - said.count("\n")
+        told = err.count("\n") - said.count("\n")
+        settled = len(json.loads((tmp_path / "s.json").read_text()))
+        assert settled - told in (0, 1)  # the signal may come between a job's end and its line
         assert (
             said == f"{line}beltrami: interrupted: {settled} of 12 jobs done; the same command with --resume goes on\n"
         )
-        assert len(json.loads((tmp_path / "s.json").read_text())) == settled
         wait_for(lambda session=process.pid: not members(session), 5)
         assert not any(map(is_hidden, contents(out)))
     batch(config, "--jobs", 2, "--resume")
