@@ -31,6 +31,9 @@ from beltrami_cli.tuning import Choice
 # Parameters that say how files are read and written, not how values are denoised.
 OF_FILES = ("resample", "spacing", "labels", "between", "map", "frame", "structure")
 
+# Of sums in single precision, which has 7.
+DIGITS = 6
+
 
 @dataclass(frozen=True, eq=False)
 class Ran:
@@ -98,8 +101,8 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
             "beta": beta.tolist(),
             "dt": [schedule.dt] * len(beta),
             "dt_over_beta": [schedule.dt / b if b else None for b in beta.tolist()],
-            "change_rms": evolution.change.tolist(),
-            "energy": evolution.energy.tolist(),
+            "change_rms": _rounded(evolution.change),
+            "energy": _rounded(evolution.energy),
             "most_substeps": ran.substeps,
         },
     }
@@ -146,6 +149,11 @@ def _chosen(choice: Choice, places: str) -> dict[str, Any]:
         "meaning": f"error: root mean square at the held-out {places}, data units; each row at its best iteration",
         "table": choice.table(),
     }
+
+
+def _rounded(sums: np.ndarray) -> list[float]:
+    """Sums over the band to the digits that hold: the last ones of single precision depend on the compiled code."""
+    return [float(f"{value:.{DIGITS}g}") for value in sums]
 
 
 def _number(value: float) -> float | None:

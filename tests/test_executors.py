@@ -55,7 +55,7 @@ def test_processes_open_nothing_before_they_are_needed():
     before = open_files()
     with Processes(500, 1) as processes:
         assert processes.slots() == 500
-        assert open_files() == before
+        assert open_files() <= before  # other things may have closed meanwhile
 
 
 def test_the_limit_of_open_files_allows_all_processes(soft_limit):
