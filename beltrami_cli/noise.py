@@ -35,16 +35,17 @@ LEAST_NOISE = 0.5
 ROUNDING = 1e-6
 
 
-def noise_sd(band: Band, samples: np.ndarray, kind: Kind) -> np.ndarray:
+def noise_sd(band: Band, samples: np.ndarray, kind: Kind, most: int = ENTRIES) -> np.ndarray:
     """Standard deviation of the noise on the surface in data units, (K,) for vectors, else (1,); NaN where unknown.
 
-    samples: (K, E) channels as they came, before extension (`extension.own_samples`), NaN where there are none.
+    samples: (K, E) channels as they came, before extension (`extension.own_samples`), NaN where there are none. most:
+    entries to look at.
     The noise of each voxel is taken as independent of its neighbours' (see `looks_correlated`). It is half the robust
     standard deviation of w = x_00 - x_10 - x_01 + x_11 over the corners of a voxel face, in which slopes and borders
     along the axes cancel. For angles w is wrapped, and the result is the circular standard deviation sqrt(-2 ln R),
     R = |mean of exp(i noise)|: the characteristic function of w is R^4. Up to about 75 degrees of 360 can be told.
     """
-    entries, axes = _near(band, samples), _axes(band)
+    entries, axes = _near(band, samples, most), _axes(band)
     values = np.arctan2(samples[1:2], samples[0:1]) if kind.is_circular else samples
     faces = [np.empty((len(values), 0))]
     for a, b in combinations(axes, 2):
@@ -224,11 +225,11 @@ def _wrapped_sd(median: float) -> float:
     return float(np.interp(0.5, below, sd, left=np.nan, right=sd[-1]))
 
 
-def _near(band: Band, values: np.ndarray) -> np.ndarray:
+def _near(band: Band, values: np.ndarray, most: int = ENTRIES) -> np.ndarray:
     """Entries within a voxel of the surface that have a value, a regular sample of them where they are many."""
     within = np.abs(band.distance) <= band.grid.used_spacing.max()
     entries = np.flatnonzero(within & ~np.isnan(values[0]))
-    return entries[:: 1 + len(entries) // ENTRIES]
+    return entries[:: 1 + len(entries) // most]
 
 
 def _axes(band: Band) -> list[int]:

@@ -21,6 +21,7 @@ from beltrami_cli.kernels import mesh as kernels
 from beltrami_cli.kinds import Kind
 from beltrami_cli.levelset import Refined, facing, refined
 from beltrami_cli.noise import (
+    ENTRIES,
     looks_correlated,
     looks_correlated_on_mesh,
     noise_sd,
@@ -132,8 +133,10 @@ class AtVoxels:
         return valid, round(share * len(valid))
 
     def noise_sd(self, u: np.ndarray | None = None) -> np.ndarray:
-        values = self.values if u is None else np.where(np.isnan(self.values), np.nan, u)
-        return noise_sd(self.band, values, self.kind)
+        if u is None:
+            return noise_sd(self.band, self.values, self.kind)
+        # What is left is told, and nothing chosen by it: 2 % will do, in a quarter of the time.
+        return noise_sd(self.band, np.where(np.isnan(self.values), np.nan, u), self.kind, ENTRIES // 4)
 
     def smoothness_mm(self, u: np.ndarray | None = None) -> float:
         return smoothness_mm(self.band, self.values if u is None else u, self.kind)
