@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 from beltrami_cli import __version__, cluster, formats
 from beltrami_cli.config import Job
-from beltrami_cli.errors import BeltramiError, BusyError, RefusedError
+from beltrami_cli.errors import BeltramiError, BusyError, RefusedError, in_a_line
 from beltrami_cli.executors import Workers, alone, deaths
 from beltrami_cli.memory import needed, require_within
 from beltrami_cli.record import forget_peak_memory, sidecar_of
@@ -161,7 +161,7 @@ class _Batch:
                     _require_free(self.study[k].job, self.policy)
             except Exception as error:
                 self._pop()
-                self._settle(k, Row(*self._names(k), "failed", reason=_reason(error)))
+                self._fail(k, _reason(error))
                 continue
             self._pop()
             self._submit(k, looks)
@@ -169,7 +169,7 @@ class _Batch:
     def _give_up(self, reason: str) -> None:
         """Nothing more can be started."""
         for k in (*self.waiting, *(k for _, k in self.busy)):
-            self._settle(k, Row(*self._names(k), "failed", reason=reason))
+            self._fail(k, reason)
         self.waiting.clear()
         self.busy.clear()
 
@@ -219,8 +219,7 @@ class _Batch:
             if lost and self.tries[k] <= self.policy.retries:
                 self.waiting.append(k)
             else:
-                reason = _lost(self.tries[k], error) if lost else _not_understood(error)
-                self._settle(k, Row(*self._names(k), "failed", reason=reason))
+                self._fail(k, _lost(self.tries[k], error) if lost else _not_understood(error))
             return
         row = future.result()
         # A worker that is told to end does so after its job, which Dask has given to another meanwhile.
@@ -246,8 +245,8 @@ class _Batch:
         self.rows[k] = row = replace(row, tries=0 if row.status == "skipped" else self.tries[k])
         self.settled(row)
 
-    def _names(self, k: int) -> tuple[str, str, str]:
-        return _names(self.study[k])
+    def _fail(self, k: int, reason: str) -> None:
+        self._settle(k, Row(*_names(self.study[k]), "failed", reason=reason))
 
 
 @dataclass(frozen=True)
@@ -428,7 +427,7 @@ def _lost(tries: int, error: BaseException) -> str:
 
 
 def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    return in_a_line(error) or type(error).__name__
 
 
 def write_summary(path: Path, rows: Sequence[Row]) -> None:

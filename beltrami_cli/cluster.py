@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from beltrami_cli.errors import RefusedError
+from beltrami_cli.errors import RefusedError, in_a_line
 from beltrami_cli.executors import Workers
 
 # Seconds to wait for a scheduler to answer: it does so at once, or its address is wrong.
@@ -94,7 +94,7 @@ def cluster(address: str, notify: Callable[[str], None] = lambda line: None) -> 
     try:
         client = _within(_ANSWER + 1, lambda: Client(where, timeout=_ANSWER, set_as_default=False))
     except (OSError, ValueError, ImportError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = in_a_line(error) or type(error).__name__
         raise RefusedError(
             f"scheduler: {where}: none answers there ({reason}); start it, or check the address"
         ) from None

@@ -14,7 +14,7 @@ import numpy as np
 
 from beltrami_cli import formats
 from beltrami_cli.config import Settings
-from beltrami_cli.errors import BeltramiError, RefusedError
+from beltrami_cli.errors import BeltramiError, RefusedError, in_a_line
 from beltrami_cli.grid import Canonical, Volume, require_same_grid
 from beltrami_cli.inputs import Warnings, band_of, require_usable
 from beltrami_cli.metrics import (
@@ -158,7 +158,7 @@ def _compared_or_reason(a: Path, b: Path, terms: Terms) -> Comparison | str:
     except MemoryError:
         return "out of memory"
     except Exception as error:  # a defect of ours is to cost one file, not the table
-        line = " ".join(str(error).split()) or "no message"
+        line = in_a_line(error) or "no message"
         return f"unexpected {type(error).__name__}: {line}; compare these two files with -v to see where"
 
 

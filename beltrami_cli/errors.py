@@ -23,3 +23,8 @@ class RefusedError(BeltramiError):
 
 class BusyError(RefusedError):
     """Refused because another run is writing the same outputs at this moment: it can be tried again later."""
+
+
+def in_a_line(error: BaseException) -> str:
+    """What any error says, without line breaks; empty where it says nothing."""
+    return " ".join(str(error).split())

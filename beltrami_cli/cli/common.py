@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import click
 
-from beltrami_cli.errors import BeltramiError, DataError
+from beltrami_cli.errors import BeltramiError, DataError, in_a_line
 
 # What commands that are running have to say where a signal ends them.
 _LAST_WORDS: list[Callable[[], str]] = []
@@ -48,7 +48,7 @@ def report_error(error: Exception, *, verbose: bool) -> int:
     if isinstance(error, MemoryError):
         _tell("beltrami: out of memory; use a smaller --band, or crop the volumes to the surface")
         return 1
-    line = " ".join(str(error).split()) or "no message"
+    line = in_a_line(error) or "no message"
     _tell(f"beltrami: unexpected {type(error).__name__}: {line}; -v shows where (please report it)")
     return 1
 
