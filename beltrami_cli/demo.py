@@ -14,7 +14,7 @@ from beltrami_cli.config import Beta, Job, Settings
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.pipeline import mesh_of, run
-from beltrami_cli.report import draw_before_after
+from beltrami_cli.report.drawing import draw_before_after
 
 PEAK = 255.0  # full scale of the phantoms' data, for PSNR
 ITERATIONS = 12

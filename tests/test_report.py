@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from beltrami_cli.errors import RefusedError
-from beltrami_cli.report import (
+from beltrami_cli.report.drawing import (
     DENOISED,
     INPUT,
     MISSING,
@@ -147,7 +147,7 @@ def test_missing_matplotlib_says_what_to_install(tmp_path, monkeypatch):
 
 def test_no_global_state_of_matplotlib_is_touched(tmp_path):
     script = (
-        "import sys, numpy as np; from pathlib import Path; from beltrami_cli.report import draw_before_after;"
+        "import sys, numpy as np; from pathlib import Path; from beltrami_cli.report.drawing import draw_before_after;"
         "from beltrami_cli.surface import Mesh; assert 'matplotlib' not in sys.modules;"
         "draw_before_after(Path(sys.argv[1]), Mesh(np.eye(3), np.array([[0, 1, 2]])), np.arange(3.), np.arange(3.));"
         "assert 'matplotlib.pyplot' not in sys.modules"
