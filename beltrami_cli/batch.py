@@ -334,7 +334,7 @@ def _make_folders(job: Job) -> None:
     """Make the folders of the outputs, once the inputs are there."""
     for path in job.all_inputs:
         formats.require_file(path)
-    outputs = (job.volume, *(job.mesh or ()), job.filled, *(file for _, file in job.on))
+    outputs = (job.volume, *(job.mesh or ()), job.filled, job.report, *(file for _, file in job.on))
     for folder in {output.parent for output in outputs if output is not None}:
         _make_folder(folder)
 

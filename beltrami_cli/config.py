@@ -406,6 +406,7 @@ class Job:
     weights: how much each voxel or vertex counts (>= 0); mask: which count at all (not 0). filled: where the mask of
     what the run filled in is written. on: surfaces, and where values at their vertices are written. structure: in
     GIFTI's names, of what is written. spacing: mm, of .npy inputs; for values at vertices, of the band's voxels.
+    report: where a picture of the run is written, .html or .png.
     memory: bytes that the run may need, None for any amount, see `parse_memory`; it changes no result.
     """
 
@@ -416,6 +417,7 @@ class Job:
     weights: Path | None = None
     mask: Path | None = None
     filled: Path | None = None
+    report: Path | None = None
     on: tuple[tuple[Path, Path], ...] = ()
     labels: str | None = None
     between: str | None = None
@@ -467,7 +469,10 @@ KEYS: dict[str, dict[str, str]] = {
         },
         **{k: k for k in ("spacing", "resample", "inside")},
     },
-    "output": {k: k for k in ("volume", "mesh", "filled", "on", "structure", "outside", "overwrite", "precision")},
+    "output": {
+        **{k: k for k in ("volume", "mesh", "filled", "report", "on", "structure")},
+        **{k: k for k in ("outside", "overwrite", "precision")},
+    },
     "flow": {"name": "flow", **{k: k for k in ("phi", "beta", "edge", "eps", "scheme", "dt", "flat", "fidelity")}},
     "time": {k: k for k in ("iterations", "time", "fwhm", "stop", "noise_sigma", "seed")},
     "band": {"half_width": "band", **{k: k for k in ("extension", "extend_every", "depth")}},
@@ -611,7 +616,7 @@ def _from_toml(path: Path, section: str, key: str, value: Any) -> Any:
             return ()
         names = value if isinstance(value, list) else [value]
         return tuple(_path(path, where, name) for name in names)
-    if key in ("levelset", "data", "weights", "mask", "volume", "filled"):
+    if key in ("levelset", "data", "weights", "mask", "volume", "filled", "report"):
         return _path(path, where, value)
     if key == "on":
         pairs = value if isinstance(value, list) else [value]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from beltrami_cli import formats, kernels
+from beltrami_cli import formats, kernels, report
 from beltrami_cli.config import Job, Settings
 from beltrami_cli.errors import BusyError, DataError, RefusedError
 from beltrami_cli.evolve import Observer
@@ -22,6 +22,7 @@ from beltrami_cli.levelset import two_values
 from beltrami_cli.memory import needed, require_within
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import sha256, sidecar, sources_of, write_record
+from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.resample import resample
 from beltrami_cli.sampling import surface_mesh
 from beltrami_cli.solver import Gathered, Result, Solver
@@ -64,7 +65,7 @@ def run(
                 work = _denoise_vertices
             else:
                 work = _denoise_series if job.settings.independent else _denoise_volume
-            solved = work(job, scene, stage, phases, warnings, observer)
+            solved, maps = work(job, scene, stage, phases, warnings, observer)
             hashes = digests.result()
         with phases("write"):
             for path in files.meshes:
@@ -73,7 +74,11 @@ def run(
                 formats.write_mesh(stage.path(path), files.held_by(path, shown))
             for (_, path), mesh, values in zip(job.on, scene.on, solved.on, strict=True):
                 formats.write_overlay(stage.path(path), values, structure=scene.structure_of(mesh))
-        record = sidecar(job, sources, files.all, hashes, solved.record, tuple(warnings.lines), phases.seconds)
+        told = (job, sources, files.all, hashes, solved.record, tuple(warnings.lines), phases.seconds)
+        if job.report is not None:
+            with phases("report"):
+                report.write(stage.path(job.report), _subject(job, scene, solved.mesh, maps, sidecar(*told)))
+        record = sidecar(*told)
         write_record(stage.path(files.sidecar), record)
         stage.commit()
     return replace(solved, record=record, warnings=tuple(warnings.lines))
@@ -81,8 +86,8 @@ def run(
 
 def _denoise_volume(
     job: Job, scene: Scene, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
-) -> Result:
-    """The result, its volumes written."""
+) -> tuple[Result, tuple[Map, ...]]:
+    """The result, its volumes written, and what a picture is to show."""
     with phases("read"):
         source, trust = _read_levelset(job, scene, warnings), _read_trust(job, warnings)
         psi = source if isinstance(source, Volume) else None
@@ -98,12 +103,12 @@ def _denoise_volume(
         formats.write_volume(stage.path(job.volume), data.with_data(solved.data), dtype=job.settings.precision)
         if job.filled is not None:
             formats.write_volume(stage.path(job.filled), data.with_data(solved.filled), dtype=np.uint8)
-    return solved
+    return solved, _maps(job, solver, data.data, solved.data, solved.mesh)
 
 
 def _denoise_series(
     job: Job, scene: Scene, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
-) -> Result:
+) -> tuple[Result, tuple[Map, ...]]:
     """As `_denoise_volume`, frame by frame."""
     with phases("read"):
         source, trust = _read_levelset(job, scene, warnings), _read_trust(job, warnings)
@@ -126,10 +131,14 @@ def _denoise_series(
 
     record: dict[str, Any] = {}
     gathered = Gathered()
+    shown: tuple[Map, ...] = ()
 
     def denoised() -> Iterator[np.ndarray]:
-        for result in solver.denoise_frames(series.count, frame, record, observer):
+        nonlocal shown
+        for t, result in enumerate(solver.denoise_frames(series.count, frame, record, observer)):
             gathered.add(result)
+            if job.report is not None and t == record["Frames"]["chosen_on"]:
+                shown = _maps(job, solver, frame(t), result.data, result.mesh)
             yield result.data
 
     formats.write_series(stage.path(job.volume), like, denoised(), dtype=job.settings.precision)
@@ -138,13 +147,13 @@ def _denoise_series(
         as_stored = with_channels(series.file_shape, series.count, 1) if like.grid.shape == series.grid.shape else ()
         filled = Volume(solved.filled, like.grid, as_stored, like.header)
         formats.write_volume(stage.path(job.filled), filled, dtype=np.uint8)
-    return solved
+    return solved, shown
 
 
 def _denoise_vertices(
     job: Job, scene: Scene, stage: formats.Stage, phases: Phases, warnings: Warnings, observer: Observer | None
-) -> Result:
-    """The result, its values at vertices written."""
+) -> tuple[Result, tuple[Map, ...]]:
+    """The result, its values at vertices written, and what a picture is to show."""
     assert scene.surface is not None
     count, dtype, several = len(scene.surface.vertices_ras_mm), job.settings.precision, job.settings.kind == "vector"
     with phases("read"):
@@ -157,7 +166,16 @@ def _denoise_vertices(
             None if path is None else formats.read_overlay(path, count, dtype=dtype) for path in (job.weights, job.mask)
         )
     solver = Solver(
-        scene.surface, scene.grid, job.settings, phases, warnings, weights, mask, at_vertices=True, on=scene.on
+        scene.surface,
+        scene.grid,
+        job.settings,
+        phases,
+        warnings,
+        weights,
+        mask,
+        at_vertices=True,
+        on=scene.on,
+        looks=job.report is not None,
     )
     work = solver.denoise_series if job.settings.independent else solver.denoise
     solved = work(data, observer)
@@ -166,7 +184,59 @@ def _denoise_vertices(
         formats.write_overlay(stage.path(job.volume), solved.data, structure=structure, dtype=dtype, names=names)
         if job.filled is not None:
             formats.write_overlay(stage.path(job.filled), solved.filled.astype(np.float32), structure=structure)
-    return solved
+    if not job.settings.independent:
+        return solved, _maps(job, solver, data, None, solved.mesh)
+    t = solved.record["Frames"]["chosen_on"]
+    assert solved.mesh is not None and solved.mesh.values is not None
+    return solved, _maps(job, solver, data[:, t], None, replace(solved.mesh, values=solved.mesh.values[:, t]))
+
+
+def _maps(job: Job, solver: Solver, given: np.ndarray, out: np.ndarray | None, mesh: Mesh | None) -> tuple[Map, ...]:
+    """Input and output as a picture shows them; none where no picture is asked for.
+
+    given: what was denoised; out: what it became, where that is a volume. mesh: with the values of the output.
+    """
+    if job.report is None:
+        return ()
+    before, after = solver.at_mesh(given), None if mesh is None else mesh.values
+    filled = None
+    if before is not None and after is not None:
+        filled = np.isnan(_first(before, 1)) & ~np.isnan(_first(after, 1))
+    if out is None:
+        return Map("input", before), Map("denoised", after, filled=filled)
+    forth = Canonical(solver.grid).forth
+    known = without(given, job.settings.missing)
+    return Map("input", before, forth(_real(known))), Map("denoised", after, forth(_real(out)), filled)
+
+
+def _first(values: np.ndarray, axes: int) -> np.ndarray:
+    """The first channel of values whose first `axes` axes are places."""
+    return values[..., 0] if values.ndim > axes else values
+
+
+def _real(volume: np.ndarray) -> np.ndarray:
+    """Complex numbers as real and imaginary part on a last axis."""
+    return np.stack([volume.real, volume.imag], -1) if np.iscomplexobj(volume) else volume
+
+
+def _subject(job: Job, scene: Scene, mesh: Mesh | None, maps: tuple[Map, ...], record: dict[str, Any]) -> Subject:
+    """What the picture of a run is about."""
+    notes, frames, wrapped = [], record.get("Frames"), record["Values"]["range"]
+    if frames is not None:
+        notes.append(f"frame {frames['chosen_on'] + 1} of {frames['count']}: the one that parameters are chosen on")
+    if job.settings.depth is not None:
+        notes.append("input: as it is at the surface, before the average over depth")
+    return Subject(
+        title=job.data.name,
+        maps=maps,
+        mesh=None if mesh is None else replace(mesh, structure=scene.structure_of(mesh)),
+        grid=None if maps[0].volume is None else Canonical(scene.grid).grid,
+        period=job.settings.period,
+        low=0.0 if wrapped is None else wrapped[0],
+        is_run=True,
+        record=record,
+        notes=tuple(notes),
+    )
 
 
 def _map(given: str | None) -> str | int | None:
@@ -189,7 +259,8 @@ def _solver(
     if mask is not None:
         mask = np.nan_to_num(mask) >= 0.5  # between voxels, where it was moved
     surface = source.data if isinstance(source, Volume) else source
-    return Solver(surface, place.grid, job.settings, phases, warnings, weights, mask, on=scene.on)
+    looks = job.report is not None
+    return Solver(surface, place.grid, job.settings, phases, warnings, weights, mask, on=scene.on, looks=looks)
 
 
 def mesh_of(

@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ class Ran:
     """One run on one set of data. values: (K, E) as they came out.
 
     excess: by how much values had left the range of the data (data units). smoothness: FWHM before and after, mm.
+    noise: pairs of an iteration and the noise that was left then, where anybody looked.
     """
 
     kind: Kind
@@ -50,6 +51,7 @@ class Ran:
     values: np.ndarray
     excess: float
     smoothness: tuple[float, float]
+    noise: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
 
 def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: Ran) -> dict[str, Any]:
@@ -104,6 +106,7 @@ def what_happened(settings: Settings, grid: Grid, band: Band, plan: Plan, ran: R
             "change_rms": _rounded(evolution.change),
             "energy": _rounded(evolution.energy),
             "most_substeps": ran.substeps,
+            **({"noise_sd": _looks(ran.noise)} if ran.noise else {}),
         },
     }
 
@@ -145,10 +148,17 @@ def _chosen(choice: Choice, places: str) -> dict[str, Any]:
         "beta": choice.beta if choice.flow.has_beta else None,
         "iterations": choice.iterations,
         f"held_out_{places}": choice.held_out,
+        "errors": _rounded(choice.errors),
         "gain_standard_errors": choice.gain,
-        "meaning": f"error: root mean square at the held-out {places}, data units; each row at its best iteration",
+        "meaning": f"error: root mean square at the held-out {places}, data units; errors: of the chosen run after 0, "
+        "1 ... iterations; each row of the table at its best iteration",
         "table": choice.table(),
     }
+
+
+def _looks(noise: list[tuple[int, np.ndarray]]) -> list[dict[str, Any]]:
+    """The noise that was left after some of the iterations, per channel, data units."""
+    return [{"iteration": k, "sd": [_number(each) for each in sd]} for k, sd in noise]
 
 
 def _rounded(sums: np.ndarray) -> list[float]:
@@ -217,6 +227,8 @@ def request(job: Job) -> dict[str, Any]:
         "mesh": None if job.mesh is None else [place(path) for path in job.mesh],
         "filled": place(job.filled),
         "on": [place(path) for _, path in job.on],
+        # Left out where there is none: no run of before there were reports is done again for want of one.
+        **({} if job.report is None else {"report": place(job.report)}),
     }
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asked.items()}
 

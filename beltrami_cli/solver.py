@@ -14,7 +14,7 @@ import numpy as np
 from beltrami_cli.config import Settings
 from beltrami_cli.course import Course
 from beltrami_cli.errors import DataError, NumericsError, RefusedError
-from beltrami_cli.evolve import Observer
+from beltrami_cli.evolve import Observer, Stop
 from beltrami_cli.extension import Extended
 from beltrami_cli.grid import Canonical, Grid
 from beltrami_cli.inputs import (
@@ -27,7 +27,7 @@ from beltrami_cli.inputs import (
     without,
 )
 from beltrami_cli.kinds import Kind, kind_of
-from beltrami_cli.observed import AtVertices, VertexBand
+from beltrami_cli.observed import AtVertices, Observed, VertexBand
 from beltrami_cli.places import Vertices, Voxels
 from beltrami_cli.planning import CORRELATED, Plan, Planner, Sample
 from beltrami_cli.progress import Phases
@@ -86,8 +86,8 @@ class Solver:
 
     surface: Psi, (nx, ny, nz), or a mesh in RAS mm; None for a flat run. at_vertices: the data lie at the vertices of
     the mesh, not in the voxels of the grid. weights: of the shape of one channel of the data, 0 or more, or None;
-    mask: likewise, which data count (not 0). on: other meshes of the surface whose vertices are to get values.
-    Raises as `denoise`.
+    mask: likewise, which data count (not 0). on: other meshes of the surface whose vertices are to get values. looks:
+    the record tells of the noise that is left as the flow goes on. Raises as `denoise`.
     """
 
     def __init__(
@@ -102,9 +102,11 @@ class Solver:
         *,
         at_vertices: bool = False,
         on: Sequence[Mesh] = (),
+        looks: bool = False,
     ) -> None:
         require_usable(grid, "the grid")
         self.grid, self.settings, self.phases, self.warnings = grid, settings, phases, warnings
+        self.looks = looks
         numba.set_num_threads(min(settings.threads or cpus(), numba.config.NUMBA_NUM_THREADS))
         iterations, dt, ends_by = settings.duration(time_step(grid, settings))
         self.planner = Planner(settings, iterations, ends_by, phases, warnings)
@@ -172,7 +174,20 @@ class Solver:
     def denoise(self, data: np.ndarray, observer: Observer | None = None) -> Result:
         """Denoise data of shape grid.shape or (V,), or with (K,) behind for a vector."""
         sample = self._sample(data, self.warnings)
-        return self._run(data, sample, self.planner.plan(sample), self.warnings, observer)
+        return self._run(data, sample, self.planner.plan(sample), self.warnings, observer, self.looks)
+
+    def at_mesh(self, data: np.ndarray) -> np.ndarray | None:
+        """The values of the data themselves, as `Result.mesh` has those of the result; None for a flat run.
+
+        data: as `denoise` takes them. NaN where a value is missing or does not count.
+        """
+        if self.settings.flat:
+            return None
+        observed = self._observed(data, Warnings(None))
+        channels = observed.values
+        if not isinstance(observed, AtVertices):
+            channels = self.shown[0][1](channels, turns=observed.kind.turns)
+        return observed.kind.at_vertices(channels)
 
     def denoise_series(self, data: np.ndarray, observer: Observer | None = None) -> Result:
         """Denoise every frame of data, one channel's shape + (K,), on its own."""
@@ -192,9 +207,11 @@ class Solver:
     ) -> Iterator[Result]:
         """Denoise `count` frames one after another, all with what is chosen on the middle one (that holds data).
 
-        frame: its number -> data of one channel's shape. record: is given the middle one's, with lists over all.
+        frame: its number -> data of one channel's shape. record: is given the middle one's, with lists over all; that
+        one's number, `Frames.chosen_on`, before the first result.
         """
         chosen_on, sample = self._first_sample(count, frame)
+        record["Frames"] = {"count": count, "chosen_on": chosen_on}
         plan = self.planner.plan(sample)
         records: list[dict[str, Any]] = []
         heard: Counter[str] = Counter()
@@ -210,8 +227,8 @@ class Solver:
                 noise = np.where(
                     np.isnan(sample.noise), plan.noise, sample.noise
                 )  # too few voxels to tell: as where it was chosen
-                choice = plan.choice if t == chosen_on else None
-                result = self._run(data, sample, replace(plan, noise=noise, choice=choice), quiet, observer)
+                choice, looks = (plan.choice, self.looks) if t == chosen_on else (None, False)
+                result = self._run(data, sample, replace(plan, noise=noise, choice=choice), quiet, observer, looks)
                 records.append(result.record)
             heard.update(quiet.lines)
             yield result
@@ -244,16 +261,9 @@ class Solver:
     def _sample(self, data: np.ndarray, warnings: Warnings) -> Sample:
         """The data as channels on the band; raises DataError where none are valid."""
         with self.phases("extend"):
-            here = without(self.places.take(data), self.settings.missing)
-            here[self.trust == 0] = np.nan
-            here = finite_or_missing(here, warnings)
-            name = "scalar" if self.settings.independent else self.settings.kind
-            kind, doubt = kind_of(name, here, self.settings.period)
-            if doubt:
-                warnings.add(doubt)
-            if kind != self.course.kind:  # else its re-extension is already prepared
-                self.course = replace(self.course, kind=kind)
-            observed = self.places.observe(here, kind, self.trust)
+            observed = self._observed(data, warnings)
+            if observed.kind != self.course.kind:  # else its re-extension is already prepared
+                self.course = replace(self.course, kind=observed.kind)
             start = observed.start()
         missing = np.isnan(start.values[0, self.band.primary]).mean()
         if missing > LONE_SHARE:
@@ -261,8 +271,25 @@ class Solver:
             warnings.add(f"{share} of the band lies on parts of the surface without any data: left missing")
         return Sample(self.course, observed, start)
 
+    def _observed(self, data: np.ndarray, warnings: Warnings) -> Observed:
+        """The data that count, as channels where they were measured."""
+        here = without(self.places.take(data), self.settings.missing)
+        here[self.trust == 0] = np.nan
+        here = finite_or_missing(here, warnings)
+        name = "scalar" if self.settings.independent else self.settings.kind
+        kind, doubt = kind_of(name, here, self.settings.period)
+        if doubt:
+            warnings.add(doubt)
+        return self.places.observe(here, kind, self.trust)
+
     def _run(
-        self, data: np.ndarray, sample: Sample, plan: Plan, warnings: Warnings, observer: Observer | None
+        self,
+        data: np.ndarray,
+        sample: Sample,
+        plan: Plan,
+        warnings: Warnings,
+        observer: Observer | None,
+        looks: bool,
     ) -> Result:
         settings, band, course, start = self.settings, self.band, sample.course, sample.start
         stop = None
@@ -273,8 +300,9 @@ class Solver:
             if settings.noise_sigma is None and sample.looks_correlated:
                 warnings.add(f"stop discrepancy: {CORRELATED}, which hides its size; give it as --noise-sigma S")
             stop = discrepancy(sample.observed, sigma)
+        watch = _NoiseWatch(sample.observed, stop) if looks else None
         with self.phases("flow"):
-            evolution, substeps = course.run(start, plan.flow, plan.schedule, observer, stop)
+            evolution, substeps = course.run(start, plan.flow, plan.schedule, observer, watch or stop)
             values, excess = _within_range(evolution.values, start, course.kind)
             values[:, sample.observed.beyond(start)] = np.nan
         if stop is not None and not evolution.iterations:
@@ -289,7 +317,8 @@ class Solver:
             if isinstance(sample.observed, AtVertices):
                 at[0][:, sample.observed.too_far[: at[0].shape[1]]] = np.nan
         smoothness = sample.observed.smoothness_mm(), sample.observed.smoothness_mm(values)
-        ran = Ran(course.kind, sample.observed, start, evolution, substeps, values, excess, smoothness)
+        noise = watch.seen if watch else []
+        ran = Ran(course.kind, sample.observed, start, evolution, substeps, values, excess, smoothness, noise)
         return self._result(
             self.places.give(values, at, course.kind, data),
             [course.kind.at_vertices(channels) for channels in at],
@@ -309,6 +338,23 @@ class Solver:
         at = [np.full((1, len(mesh.vertices_ras_mm)), np.nan, data.dtype) for mesh, _ in self.shown]
         out = self.places.give(values, at, Kind(), data)
         return self._result(out, [channels[0] for channels in at], np.zeros(data.shape, bool), {})
+
+
+class _NoiseWatch:
+    """Looks at the noise that is left after each of the first iterations, then after fewer and fewer of them.
+
+    seen: pairs of how many iterations were done, and standard deviations as `noise.noise_sd` finds them.
+    """
+
+    def __init__(self, observed: Observed, stop: Stop | None) -> None:
+        self.observed, self.stop = observed, stop
+        self.seen: list[tuple[int, np.ndarray]] = []
+
+    def __call__(self, k: int, u: np.ndarray) -> str | None:
+        # All up to 16, then 8 in each doubling: a curve, at little cost however long the run.
+        if k % (1 << (k // 16).bit_length()) == 0:
+            self.seen.append((k, self.observed.noise_sd(u)))
+        return self.stop(k, u) if self.stop is not None else None
 
 
 def _within_range(values: np.ndarray, start: Extended, kind: Kind) -> tuple[np.ndarray, float]:

@@ -353,7 +353,8 @@ def _written(planned: Planned) -> list[Path]:
         outputs += [file for mesh in meshes for file in formats.mesh_files(mesh, values=not bare)]
     except RefusedError as error:
         raise RefusedError(f"{planned.config}: {planned.name}: {error}") from None
-    return [*outputs, *(file for _, file in job.on), sidecar_of(job.volume)]
+    pictures = [job.report] if job.report else []
+    return [*outputs, *(file for _, file in job.on), *pictures, sidecar_of(job.volume)]
 
 
 def _volume_files(path: Path) -> list[Path]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from beltrami_cli import formats
+from beltrami_cli import formats, report
 from beltrami_cli.config import Job
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.grid import Grid, Volume, require_same_grid
@@ -49,6 +49,8 @@ def survey(job: Job) -> Scene:
     """What the job is about, from headers and surfaces; raises RefusedError where files will not do."""
     for path in job.all_inputs:
         formats.require_file(path)
+    if job.report is not None:
+        report.require(job.report)
     structure = None if job.structure is None else formats.parse_structure(job.structure)
     surface, at_vertices = None, False
     if formats.is_surface(job.data):
@@ -118,7 +120,8 @@ class Files:
                     f"on: {file} is also where the values of the mesh beside OUT go; give another name, or --no-mesh"
                 )
         self.sidecar = sidecar_of(job.volume)
-        self.all = [*files_of(job.volume), *filled, *written, *on, self.sidecar]
+        pictures = [] if job.report is None else [job.report]
+        self.all = [*files_of(job.volume), *filled, *written, *on, *pictures, self.sidecar]
 
     def held_by(self, path: Path, mesh: Mesh) -> Mesh:
         """The mesh as its file is to hold it."""

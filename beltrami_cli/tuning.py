@@ -65,6 +65,11 @@ class Choice:
     curves: tuple[Curve, ...] = field(repr=False)
 
     @property
+    def errors(self) -> np.ndarray:
+        """(n + 1,) root mean square error of the run of least error after 0..n iterations, data units."""
+        return np.sqrt(min(self.curves, key=lambda c: c.error).errors)
+
+    @property
     def is_clear(self) -> bool:
         return self.gain >= CLEAR
 

@@ -57,6 +57,12 @@ class Denoise(Command):
 )
 @click.option("--no-mesh", is_flag=True, default=None, help="Write no mesh.")
 @click.option("--filled", type=FILE, help="A mask of the voxels or vertices that had no value and got one.")
+@click.option(
+    "--report",
+    type=FILE,
+    metavar="FILE.html|.png",
+    help="A picture of the run: a page for any browser, or a sheet. Needs the extra [report].",
+)
 @click.option("--weights", type=FILE, help="How much each value of DATA counts: R^2, coherence ...; 0 or more.")
 @click.option("--mask", type=FILE, help="Which values of DATA count: those where it is not 0. All else is missing.")
 @click.option(
