@@ -17,7 +17,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Literal
 
-from beltrami_cli import __version__, cluster, formats
+from beltrami_cli import __version__, cluster, formats, report
 from beltrami_cli.config import Job
 from beltrami_cli.errors import BeltramiError, BusyError, RefusedError, in_a_line
 from beltrami_cli.executors import Workers, alone, deaths
@@ -430,18 +430,29 @@ def _line(error: BaseException) -> str:
     return in_a_line(error) or type(error).__name__
 
 
-def write_summary(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows as .csv or .json, replacing what is there; makes its folder. Raises RefusedError where it cannot."""
-    text = _as_csv(rows) if _summary_format(path) == "csv" else _as_json(rows)
+def write_summary(path: Path, rows: Sequence[Row], study: Sequence[Planned] = ()) -> None:
+    """Write rows as .csv or .json, or as a page (.html) with links to the reports of the study's jobs.
+
+    Replaces what is there; makes its folder. Raises RefusedError where it cannot.
+    """
+    kind = _summary_format(path)
     _make_folder(path.parent)
     with formats.Stage([path], overwrite=True) as stage, formats.writing(path):
-        stage.path(path).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
+        if kind == "html":
+            from beltrami_cli.report import index
+
+            pages = {planned.name: planned.job.report for planned in study}
+            index.write(stage.path(path), [asdict(row) for row in rows], pages, folder=path.absolute().parent)
+        else:
+            text = _as_csv(rows) if kind == "csv" else _as_json(rows)
+            stage.path(path).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
         stage.commit()
 
 
 def require_summary(path: Path, study: Sequence[Planned], policy: Policy) -> None:
     """Raise RefusedError where a summary cannot be written, or would replace what is no summary."""
-    _summary_format(path)
+    if _summary_format(path) == "html":
+        report.require(path)
     if os.path.realpath(path) in files_of(study):
         raise RefusedError(f"{path}: is a file of the study, which the summary would replace; give another name")
     if os.path.lexists(path):
@@ -458,6 +469,8 @@ def _is_summary(path: Path) -> bool:
         text = path.read_text(encoding="utf-8")
         if _summary_format(path) == "csv":
             return text.startswith("job,config,output,status,")
+        if _summary_format(path) == "html":
+            return report.INDEX in text
         rows = json.loads(text)
         return isinstance(rows, list) and all(isinstance(row, dict) and {"job", "status"} <= row.keys() for row in rows)
     except (OSError, ValueError):
@@ -465,10 +478,10 @@ def _is_summary(path: Path) -> bool:
 
 
 def _summary_format(path: Path) -> str:
-    """csv or json; raises RefusedError for another suffix."""
+    """csv, json or html; raises RefusedError for another suffix."""
     suffix = path.suffix.lower()
-    if suffix not in (".csv", ".json"):
-        raise RefusedError(f"summary: found {path}; expected a name that ends in .csv or .json")
+    if suffix not in (".csv", ".json", ".html"):
+        raise RefusedError(f"summary: found {path}; expected a name that ends in .csv, .json or .html")
     return suffix[1:]
 
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from beltrami_cli import formats, phantoms
+from beltrami_cli import formats, phantoms, report
 from beltrami_cli.config import Beta, Job, Settings
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.evolve import Observer
-from beltrami_cli.pipeline import mesh_of, run
-from beltrami_cli.report.drawing import draw_before_after
+from beltrami_cli.pipeline import run
 
 PEAK = 255.0  # full scale of the phantoms' data, for PSNR
 ITERATIONS = 12
@@ -23,7 +21,7 @@ BETA = Beta((0.1,))  # mm per data unit: slopes over 10 units per mm stay; the t
 
 @dataclass(frozen=True)
 class Demo:
-    """psnr_*: dB over the surface's voxels. picture: None where matplotlib is not installed."""
+    """psnr_*: dB over the surface's voxels. picture: None where what draws it is not installed."""
 
     record: dict[str, Any]
     mesh: Path
@@ -47,21 +45,16 @@ def run_demo(
     out, mesh, picture, sidecar = (outdir / f"denoised{suffix}" for suffix in (".nii.gz", ".ply", ".png", ".json"))
     formats.Stage([out, mesh, picture, sidecar], overwrite=overwrite)  # refuses before anything is made
     levelset, clean, noisy = given or _make_torus(outdir, overwrite)
-    job = Job(noisy, out, levelset, (mesh,), overwrite=overwrite, settings=Settings(beta=BETA, iterations=ITERATIONS))
-    drawn = find_spec("matplotlib") is not None
-    with formats.Stage([picture] if drawn else [], overwrite=overwrite) as stage:
-        result = run(job, observer=observer)
-        psi, truth, data = (formats.read_volume(path).data for path in (levelset, clean, noisy))
-        if drawn:
-            before = mesh_of(levelset, noisy).values
-            assert before is not None and result.mesh is not None and result.mesh.values is not None
-            draw_before_after(stage.path(picture), result.mesh, before, result.mesh.values)
-            stage.commit()
+    shown = None if report.missing(picture) else picture
+    settings = Settings(beta=BETA, iterations=ITERATIONS)
+    job = Job(noisy, out, levelset, (mesh,), report=shown, overwrite=overwrite, settings=settings)
+    result = run(job, observer=observer)
+    psi, truth, data = (formats.read_volume(path).data for path in (levelset, clean, noisy))
     near = (np.abs(psi) < 0.5) & np.isfinite(result.data)
     return Demo(
         result.record,
         mesh,
-        picture if drawn else None,
+        shown,
         *(float(20 * np.log10(PEAK / np.sqrt(np.mean((v - truth)[near] ** 2)))) for v in (data, result.data)),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -89,15 +89,11 @@ def _denoise_volume(
 ) -> tuple[Result, tuple[Map, ...]]:
     """The result, its volumes written, and what a picture is to show."""
     with phases("read"):
-        source, trust = _read_levelset(job, scene, warnings), _read_trust(job, warnings)
-        psi = source if isinstance(source, Volume) else None
-        plane = is_plane(job, scene.grid)
-        data = read(job, job.data, warnings, channels=job.settings.kind == "vector", plane=plane)
-        place = psi or scene.place
-        data = _onto(_that_counts(data, trust, job), place, job, f"DATA {job.data}", period=job.settings.period)
-        if psi is not None and formats.volume_format(job.volume) != formats.volume_format(job.data):
-            data = replace(data, header=psi.header)
-    solver = _solver(job, scene, source, trust, psi or data, phases, warnings)
+        source, trust = read_levelset(job, scene, warnings), _read_trust(job, warnings)
+        data = read_data(job, scene, source, warnings, trust)
+        if isinstance(source, Volume) and formats.volume_format(job.volume) != formats.volume_format(job.data):
+            data = replace(data, header=source.header)
+    solver = solver_on(source if isinstance(source, Volume) else data, job, scene, source, trust, phases, warnings)
     solved = solver.denoise(data.data, observer)
     with phases("write"):
         formats.write_volume(stage.path(job.volume), data.with_data(solved.data), dtype=job.settings.precision)
@@ -111,7 +107,7 @@ def _denoise_series(
 ) -> tuple[Result, tuple[Map, ...]]:
     """As `_denoise_volume`, frame by frame."""
     with phases("read"):
-        source, trust = _read_levelset(job, scene, warnings), _read_trust(job, warnings)
+        source, trust = read_levelset(job, scene, warnings), _read_trust(job, warnings)
         psi = source if isinstance(source, Volume) else None
         series = formats.open_series(
             job.data,
@@ -122,7 +118,7 @@ def _denoise_series(
         pass_on(series, warnings)
     place = psi or scene.place
     like = replace(series, grid=place.grid)
-    solver = _solver(job, scene, source, trust, place, phases, warnings)
+    solver = solver_on(place, job, scene, source, trust, phases, warnings)
 
     def frame(t: int) -> np.ndarray:
         with phases("read"):
@@ -157,7 +153,7 @@ def _denoise_vertices(
     assert scene.surface is not None
     count, dtype, several = len(scene.surface.vertices_ras_mm), job.settings.precision, job.settings.kind == "vector"
     with phases("read"):
-        data, names = formats.read_named_overlay(job.data, count, dtype=dtype, channels=several, map=_map(job.map))
+        data, names = formats.read_named_overlay(job.data, count, dtype=dtype, channels=several, map=map_of(job))
         if several and data.ndim == 1:
             data = data[:, None]
         for path in (job.volume, *(file for _, file in job.on)):
@@ -206,7 +202,7 @@ def _maps(job: Job, solver: Solver, given: np.ndarray, out: np.ndarray | None, m
         return Map("input", before), Map("denoised", after, filled=filled)
     forth = Canonical(solver.grid).forth
     known = without(given, job.settings.missing)
-    return Map("input", before, forth(_real(known))), Map("denoised", after, forth(_real(out)), filled)
+    return Map("input", before, forth(parts(known))), Map("denoised", after, forth(parts(out)), filled)
 
 
 def _first(values: np.ndarray, axes: int) -> np.ndarray:
@@ -214,7 +210,7 @@ def _first(values: np.ndarray, axes: int) -> np.ndarray:
     return values[..., 0] if values.ndim > axes else values
 
 
-def _real(volume: np.ndarray) -> np.ndarray:
+def parts(volume: np.ndarray) -> np.ndarray:
     """Complex numbers as real and imaginary part on a last axis."""
     return np.stack([volume.real, volume.imag], -1) if np.iscomplexobj(volume) else volume
 
@@ -239,20 +235,31 @@ def _subject(job: Job, scene: Scene, mesh: Mesh | None, maps: tuple[Map, ...], r
     )
 
 
-def _map(given: str | None) -> str | int | None:
-    return int(given) if given is not None and given.isdecimal() else given
+def map_of(job: Job) -> str | int | None:
+    """Which of several maps of DATA at vertices is meant: its name, or its number from 1."""
+    return int(job.map) if job.map is not None and job.map.isdecimal() else job.map
 
 
-def _solver(
+def read_data(
+    job: Job, scene: Scene, source: Volume | Mesh | None, warnings: Warnings, trust: Mapping[str, Volume]
+) -> Volume:
+    """DATA, a volume, on the grid to compute on. source, trust: LEVELSET, weights and mask, as they were read."""
+    plane = is_plane(job, scene.grid)
+    data = read(job, job.data, warnings, channels=job.settings.kind == "vector", plane=plane)
+    place = source if isinstance(source, Volume) else scene.place
+    return _onto(_that_counts(data, trust, job), place, job, f"DATA {job.data}", period=job.settings.period)
+
+
+def solver_on(
+    place: Volume,
     job: Job,
     scene: Scene,
     source: Volume | Mesh | None,
-    trust: dict[str, Volume],
-    place: Volume,
+    trust: Mapping[str, Volume],
     phases: Phases,
     warnings: Warnings,
 ) -> Solver:
-    """The solver on the grid of `place`, onto which weights and mask are brought."""
+    """The solver on the grid of `place`, onto which weights and mask are brought. source: LEVELSET as it was read."""
     with phases("read"):
         here = {name: _onto(volume, place, job, name).data for name, volume in trust.items()}
         weights, mask = here.get("weights"), here.get("mask")
@@ -302,7 +309,8 @@ def mesh_of(
     return replace(mesh, values=kind.at_vertices(values))
 
 
-def _read_levelset(job: Job, scene: Scene, warnings: Warnings) -> Volume | Mesh | None:
+def read_levelset(job: Job, scene: Scene, warnings: Warnings) -> Volume | Mesh | None:
+    """LEVELSET as a level set or, where it is a surface or a segmentation, as a mesh; None for a flat run."""
     if job.levelset is None or scene.surface is not None:
         return scene.surface
     if 1 in scene.grid.shape:
@@ -337,7 +345,7 @@ def _read_trust(job: Job, warnings: Warnings) -> dict[str, Volume]:
     return trust
 
 
-def _that_counts(data: Volume, trust: dict[str, Volume], job: Job) -> Volume:
+def _that_counts(data: Volume, trust: Mapping[str, Volume], job: Job) -> Volume:
     """Data that are to be resampled, NaN where missing, and where a mask or weights on their own grid exclude them."""
     if not job.resample:
         return data

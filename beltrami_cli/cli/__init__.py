@@ -20,6 +20,7 @@ from beltrami_cli.cli.levelset import levelset
 from beltrami_cli.cli.mesh import mesh
 from beltrami_cli.cli.phantom import phantom
 from beltrami_cli.cli.sample import sample
+from beltrami_cli.cli.view import view
 
 # What ends a run, and the exit code that it gives.
 STOPPED: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
@@ -38,7 +39,7 @@ def beltrami() -> None:
     """Denoise data that lie on a surface - a level set, a segmentation or a mesh -, above all maps on the cortex."""
 
 
-for command in (denoise, batch, levelset, mesh, sample, phantom, compare, info, demo):
+for command in (denoise, batch, levelset, mesh, sample, view, phantom, compare, info, demo):
     beltrami.add_command(command)
 
 

@@ -47,6 +47,9 @@ MOST_SHOWN = 3
 @click.option(
     "--summary", type=FILE, metavar="FILE", help="Write what became of the jobs as .csv or .json; one for each part."
 )
+@click.option(
+    "--report", type=FILE, metavar="FILE.html", help="The same as a page, with links to the jobs' own reports."
+)
 @click.option("--part", metavar="K/N", help="Only every N-th job from the K-th: for a scheduler's array of jobs.")
 @click.option("--threads", type=click.IntRange(1), help="Of each job. Default: the CPUs shared by the jobs at once.")
 @click.option(
@@ -69,6 +72,7 @@ def batch(
     resume: bool,
     dry_run: bool,
     summary: Path | None,
+    report: Path | None,
     part: str | None,
     threads: int | None,
     memory: str | None,
@@ -111,8 +115,12 @@ def batch(
     policy = Policy(resume, bool(overwrite), retries, limit, available())
     whole = studies.read_study(configs)
     study = whole if part is None else studies.part(whole, part)
-    if summary is not None:
-        require_summary(summary, whole, policy)
+    for option, path, suffixes in (("summary", summary, (".csv", ".json")), ("report", report, (".html",))):
+        if path is not None and path.suffix.lower() not in suffixes:
+            raise click.UsageError(f"--{option}: found {path}; expected a name that ends in {' or '.join(suffixes)}")
+    summaries = [path for path in (summary, report) if path is not None]
+    for path in summaries:
+        require_summary(path, whole, policy)
     if not study:
         say(quiet, f"no jobs in part {part} of {_jobs(len(whole))}")
     if dry_run:
@@ -121,28 +129,30 @@ def batch(
     at_once = min(jobs or 1, max(len(study), 1))
     study = _with_threads(study, threads, None if scheduler else at_once)
     known: dict[str, Row | None] = {planned.name: None for planned in study}
-    with at_stop(partial(_stopped, known, summary, bool(overwrite))):
+    with at_stop(partial(_stopped, known, summaries, study, bool(overwrite))):
         with (
             _workers(scheduler, at_once, study, quiet) as workers,
             _Progress(known, quiet, bool(verbose)) as progress,
         ):
             rows = run(study, workers, policy, settled=progress.settled, watch=progress.watch, notify=progress.notify)
         try:
-            if summary is not None:
-                write_summary(summary, rows)
+            for path in summaries:
+                write_summary(path, rows, study)
         finally:
             _tell_rows(rows, quiet)
     return 1 if any(row.status == "failed" for row in rows) else 0
 
 
-def _stopped(known: Mapping[str, Row | None], summary: Path | None, overwrite: bool) -> str:
-    """How far a batch is that a signal ends now; the summary of what is settled is written."""
+def _stopped(
+    known: Mapping[str, Row | None], summaries: Sequence[Path], study: Sequence[Planned], overwrite: bool
+) -> str:
+    """How far a batch is that a signal ends now; the summaries of what is settled are written."""
     from beltrami_cli.batch import write_summary
 
     rows = [row for row in known.values() if row is not None]
-    if summary is not None:
+    for path in summaries:
         with suppress(Exception):
-            write_summary(summary, rows)
+            write_summary(path, rows, study)
     failed = sum(row.status == "failed" for row in rows)
     told = f"{len(rows) - failed} of {_jobs(len(known))} done" + (f", {failed} failed" if failed else "")
     return f"{told}; the same command with --resume{' in place of --overwrite' if overwrite else ''} goes on"

@@ -14,16 +14,26 @@ NEEDS = {
     ".html": ("matplotlib", "colorcet", "fast_simplification", "plotly", "jinja2"),
 }
 
+# What the index page of a batch is known by.
+INDEX = '<meta name="generator" content="beltrami batch">'
+
+
+def missing(path: Path) -> list[str]:
+    """The packages that drawing this file needs and that are not installed.
+
+    Raises RefusedError unless the path's suffix is .png or .html.
+    """
+    needed = NEEDS.get(path.suffix.lower())
+    if needed is None:
+        raise RefusedError(f"{path}: pictures are written as {' or '.join(NEEDS)}; give it one of these suffixes")
+    return [name for name in needed if find_spec(name) is None]
+
 
 def require(path: Path) -> None:
     """Raise RefusedError unless the path's suffix is .png or .html and what draws it is installed."""
-    needed = NEEDS.get(path.suffix.lower())
-    if needed is None:
-        raise RefusedError(f"{path}: found the suffix {path.suffix or 'none'!r}; expected {' or '.join(NEEDS)}")
-    missing = [name for name in needed if find_spec(name) is None]
-    if missing:
+    if lacking := missing(path):
         raise RefusedError(
-            f"{path}: pictures need {', '.join(missing)}, not installed; pip install 'beltrami_cli[report]'"
+            f"{path}: pictures need {', '.join(lacking)}, not installed: pip install 'beltrami_cli[report]'"
         )
 
 
