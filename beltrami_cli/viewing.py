@@ -113,6 +113,7 @@ def _meshes(view: View) -> Subject:
         columns = list(formats.read_values(file).values())
         values = np.stack(columns, -1) if columns else np.full((len(mesh.vertices_ras_mm), 1), np.nan)
         maps.append(Map(title, without(values, view.missing)))
+    _require_as_many([each.values for each in maps if each.values is not None], axes=1)
     return _subject(view, maps, first)
 
 
@@ -130,6 +131,7 @@ def _maps(view: View, warnings: Warnings) -> Subject:
     for job, title in zip(jobs, view.names, strict=True):
         values = formats.read_overlay(job.data, len(surface.vertices_ras_mm), channels=True, map=map_of(job))
         maps.append(Map(title, without(values, view.missing)))
+    _require_as_many([each.values for each in maps if each.values is not None], axes=1)
     return _subject(view, maps, replace(surface, structure=scenes[0].structure_of(surface)))
 
 
@@ -141,6 +143,7 @@ def _volumes(view: View, jobs: Sequence[tuple[Job, Scene]], warnings: Warnings) 
     place = source if isinstance(source, Volume) else given[0]
     for job, data in zip(jobs, given, strict=True):
         require_same_grid(given[0].grid, f"VOLUME {first.data}", data.grid, f"VOLUME {job[0].data}", remedy=REMEDY)
+    _require_as_many([data.data for data in given], axes=3)
     solver = solver_on(place, first, scene, source, {}, Phases(), warnings)
     axes = Canonical(place.grid)
     maps = []
@@ -179,11 +182,16 @@ def _is_plane(levelset: Path) -> bool:
     return not formats.is_surface(levelset) and 1 in formats.read_grid(levelset).shape
 
 
+def _require_as_many(arrays: Sequence[np.ndarray], axes: int) -> None:
+    """Raise RefusedError unless all have as many channels, of one kind, behind the first `axes` axes."""
+    found = [(*(array.shape[axes:] or (1,)), "complex" if np.iscomplexobj(array) else "real") for array in arrays]
+    if len(set(found)) > 1:
+        told = ", ".join(f"{count} {kind}" for count, kind in found)
+        raise RefusedError(f"channels or frames differ: found {told}; expected as many in each file")
+
+
 def _subject(view: View, maps: Sequence[Map], mesh: Mesh | None) -> Subject:
     """Angles run from 0 or, where some are negative, from minus half a period, as `kinds.kind_of` has it."""
-    counts = {Subject(each.title, (each,)).channels for each in maps}
-    if len(counts) > 1:
-        raise RefusedError(f"channels or frames differ: found {sorted(counts)}; expected as many in each file")
     low = 0.0
     if view.period is not None:
         values = [m.volume if m.values is None else m.values for m in maps]

@@ -1,0 +1,144 @@
+"""beltrami view: which maps it shows on which surface, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import ball, beltrami, contents, done, load, nifti, noisy, npy, refused
+
+from beltrami_cli import report
+from beltrami_cli.report.subject import Subject
+
+
+@pytest.fixture
+def shown(monkeypatch) -> list[Subject]:
+    """The subjects of the pictures, which are not drawn."""
+    subjects: list[Subject] = []
+
+    def keep(path: Path, subject: Subject) -> None:
+        subjects.append(subject)
+        path.write_text("drawn")
+
+    monkeypatch.setattr(report, "write", keep)
+    return subjects
+
+
+@pytest.fixture
+def files(tmp_path) -> dict[str, Path]:
+    psi, a, b = ball(), noisy(), noisy(seed=1, mean=70)
+    made = {name: nifti(tmp_path / f"{name}.nii.gz", v) for name, v in {"psi": psi, "a": a, "b": b}.items()}
+    done("mesh", made["psi"], made["a"], "-o", tmp_path / "m.surf.gii")
+    done("mesh", made["psi"], made["b"], "-o", tmp_path / "n.ply")
+    done("mesh", made["psi"], made["a"], "-o", tmp_path / "m.ply")
+    mesh = {"mesh": tmp_path / "m.surf.gii", "metric": tmp_path / "m.func.gii"}
+    return {**made, **mesh, "ply": tmp_path / "m.ply", "other": tmp_path / "n.ply", "out": tmp_path / "o.png"}
+
+
+def titles(subject: Subject) -> list[str]:
+    return [each.title for each in subject.maps]
+
+
+def test_volumes_on_a_level_set(files, shown):
+    run = done("view", files["a"], files["b"], "--levelset", files["psi"], "-o", files["out"])
+    assert run.out == f"wrote {files['out']}\n"
+    (subject,) = shown
+    assert titles(subject) == ["a", "b"]
+    assert not subject.is_run
+    assert np.allclose(subject.maps[0].volume, load(files["a"]))
+    assert subject.maps[0].values.mean() == pytest.approx(50, abs=1.5)
+    assert subject.maps[1].values.mean() == pytest.approx(70, abs=1.5)
+    again = refused("view", files["a"], "--levelset", files["psi"], "-o", files["out"])
+    assert "exists already" in again
+    done("view", files["a"], "--levelset", files["psi"], "-o", files["out"], "--overwrite")
+
+
+def test_what_is_shown_is_what_a_mesh_of_it_holds(files, shown):
+    done("view", files["a"], "--levelset", files["psi"], "-o", files["out"])
+    done("view", files["ply"], "-o", files["out"], "--overwrite")
+    on_psi, on_mesh = (subject.maps[0].values for subject in shown)
+    assert np.allclose(on_psi, on_mesh[:, 0], atol=1e-4)
+
+
+def test_compare_shows_the_difference(files, shown):
+    done("view", "--compare", files["a"], files["b"], "--levelset", files["psi"], "-o", files["out"])
+    (subject,) = shown
+    assert subject.is_run
+    assert titles(subject) == ["a", "b"]
+    assert subject.removed().mean() == pytest.approx(-20, abs=2)
+
+
+def test_values_at_vertices_and_meshes(files, shown):
+    done("view", files["metric"], "--levelset", files["mesh"], "-o", files["out"])
+    done("view", "--compare", files["ply"], files["other"], "-o", files["out"], "--overwrite")
+    done("view", files["mesh"], "-o", files["out"], "--overwrite")
+    done("view", files["a"], "--levelset", files["mesh"], "-o", files["out"], "--overwrite")
+    metric, meshes, bare, volume = shown
+    assert metric.grid is None
+    assert metric.maps[0].values.mean() == pytest.approx(50, abs=1.5)
+    assert meshes.removed().mean() == pytest.approx(-20, abs=2)
+    assert bare.maps[0].values.shape[1] == 1
+    assert volume.grid is not None
+    assert len(volume.maps[0].values) == len(metric.maps[0].values)
+
+
+def test_titles(files, shown, tmp_path):
+    (tmp_path / "s").mkdir()
+    twin = nifti(tmp_path / "s" / "a.nii.gz", noisy())
+    common = ("--levelset", files["psi"], "-o", files["out"], "--overwrite")
+    done("view", files["a"], files["b"], *common, "--titles", "noisy, beta 0.1")
+    done("view", files["a"], twin, *common)
+    assert titles(shown[0]) == ["noisy", "beta 0.1"]
+    assert titles(shown[1]) == [f"{tmp_path.name}/a", "s/a"]
+    assert "titles: found 1; expected 2" in refused("view", files["a"], twin, *common, "--titles", "noisy")
+
+
+def test_angles_channels_and_slices_alone(files, shown, tmp_path):
+    out = ("-o", files["out"], "--overwrite")
+    signed = nifti(tmp_path / "signed.nii.gz", noisy(mean=0))
+    done("view", signed, "--levelset", files["psi"], "--period", "360", *out)
+    assert (shown[0].period, shown[0].low) == (360, -180)
+    several = nifti(tmp_path / "several.nii.gz", np.stack([noisy(), noisy(mean=9)], -1))
+    done("view", several, "--levelset", files["psi"], *out)
+    assert shown[1].channels == 2
+    done("view", files["a"], *out)
+    assert shown[2].mesh is None
+    plane = (24, 24)
+    psi, data = npy(tmp_path / "psi.npy", ball(plane, 8)), npy(tmp_path / "data.npy", noisy(plane))
+    done("view", data, "--levelset", psi, *out)
+    assert shown[3].is_curve
+    assert refused("view", files["a"], several, "--levelset", files["psi"], *out).startswith("channels or frames")
+
+
+def test_missing_values(files, shown, tmp_path):
+    holes = noisy()
+    holes[:8] = -1
+    given = nifti(tmp_path / "holes.nii.gz", holes)
+    done("view", given, "--levelset", files["psi"], "--missing=-1", "-o", files["out"])
+    (subject,) = shown
+    left = subject.mesh.vertices_ras_mm[:, 0] < 6
+    assert np.isnan(subject.maps[0].values[left]).all()
+    assert np.isnan(subject.maps[0].volume[:8]).all()
+
+
+def test_refuses(files, tmp_path):
+    out = ("-o", files["out"])
+    before = contents(tmp_path)
+    psi = ("--levelset", files["psi"])
+    assert "VOLUME is missing" in refused("view", *psi, *out)
+    assert "compare: found 3 files" in refused("view", "--compare", files["a"], files["a"], files["b"], *psi, *out)
+    assert "compare: found 1 files" in refused("view", "--compare", files["a"], *psi, *out)
+    assert "nothing.nii.gz" in refused("view", tmp_path / "nothing.nii.gz", *psi, *out)
+    assert "pictures are written as" in refused("view", files["a"], *psi, "-o", tmp_path / "o.jpg")
+    assert "swapped" in refused("view", files["mesh"], *psi, *out)
+    assert "one kind" in refused("view", files["a"], files["metric"], "--levelset", files["mesh"], *out)
+    small = nifti(tmp_path / "small.nii.gz", noisy((8, 8, 8)))
+    assert "grids differ" in beltrami("view", files["a"], small, *psi, *out).err
+    assert "grids differ" in beltrami("view", files["a"], small, *out).err
+    small.unlink()
+    done("mesh", nifti(tmp_path / "p.nii.gz", ball(radius=4)), "-o", tmp_path / "p.ply")
+    assert "same order" in refused("view", files["ply"], tmp_path / "p.ply", *out)
+    for name in ("p.nii.gz", "p.ply"):
+        (tmp_path / name).unlink()
+    assert contents(tmp_path) == before
