@@ -15,12 +15,16 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 HEAVY = {
     "SimpleITK",
+    "colorcet",
     "distributed",
+    "fast_simplification",
     "igl",
+    "jinja2",
     "matplotlib",
     "meshio",
     "nibabel",
     "numba",
+    "plotly",
     "scipy",
     "skimage",
     "tqdm",
@@ -41,10 +45,15 @@ def imported_packages(folder: str) -> set[str]:
             elif isinstance(node, ast.ImportFrom) and node.module:
                 names.add(node.module.split(".")[0])
     own = {"beltrami_cli"} | {file.stem for file in (ROOT / folder).glob("*.py")}
-    return {
-        {"skimage": "scikit-image", "igl": "libigl", "dask_jobqueue": "dask-jobqueue"}.get(name, name)
-        for name in names - set(sys.stdlib_module_names) - own
+    distributions = {
+        "skimage": "scikit-image",
+        "igl": "libigl",
+        "dask_jobqueue": "dask-jobqueue",
+        "fast_simplification": "fast-simplification",
+        "PIL": "matplotlib",  # which depends on it
+        "markupsafe": "jinja2",  # likewise
     }
+    return {distributions.get(name, name) for name in names - set(sys.stdlib_module_names) - own}
 
 
 def names_of(requirements: list[str]) -> set[str]:
