@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: help demo test lint regression clean
+.PHONY: help demo test lint regression docs gallery dist clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -33,8 +33,20 @@ regression: $(VENV)/.installed-dev  ## denoise synthetic volumes and compare wit
 	$(BIN)/beltrami compare $(SYNTHETIC)/torus/clean.nii.gz $(RESULTS)/torus_symmetric_beta0.5.nii.gz \
 		--levelset $(SYNTHETIC)/torus/levelset.nii.gz --data-range 255 --min-psnr 29
 
+docs: $(VENV)/.installed-docs  ## build the documentation into docs/_build/html; a warning is an error
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+
+gallery: $(VENV)/.installed-demo  ## make the pictures of docs/gallery.md anew
+	$(BIN)/python .ci/gallery.py
+
+dist: $(VENV)/.installed-dev  ## build sdist and wheel, and check them in a fresh environment
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/python .ci/check_dist.py dist
+
 clean:  ## remove the virtual environment, caches and what the demo wrote
-	rm -rf $(VENV) build dist demo_out .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache *.egg-info
+	rm -rf $(VENV) build dist demo_out docs/_build .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
@@ -45,6 +57,10 @@ $(BIN)/python:
 
 $(VENV)/.installed-demo: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[report]'
+	@touch $@
+
+$(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml | $(BIN)/python

@@ -1,25 +1,40 @@
 """Surfaces with known data: a level set, the clean values and the noisy ones, made from formulas.
 
-Psi is in voxels of 1 mm and negative inside. Clean values fill the whole volume: a voxel holds the value at its nearest
-surface point, so that they are constant along normals. Noise is Gaussian, independent in every voxel.
+Psi is in voxels of 1 mm and negative inside. Clean values fill the whole volume, or a ribbon of the cortex: a voxel
+holds the value at its nearest surface point, so that they are constant along normals. Noise is Gaussian, independent in
+every voxel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.grid import Grid, Volume
 
+if TYPE_CHECKING:
+    from beltrami_cli.levelset import ZeroSurface
+
 # A symmetric place hides errors and puts zeros of Psi on voxels: the centre lies off every voxel and face (in voxels).
 OFF_GRID = 0.137
 
 # Below, the tube of the torus has a radius under 2 voxels; above, the formulas' float64 arrays take more than 10 GB.
 SIZES = (16, 512)
+
+# The cortex at size 72, in mm: the lobe's semi-axes; half-width and depth of a sulcus; half the ribbon's thickness.
+LOBE = np.array([24.0, 29.0, 23.0])
+SULCUS = (1.9, 8.5)
+RIBBON = 4.0
+# Radians of the folding pattern per radian around the lobe: sulci are about 9 mm apart.
+FOLDING = 9.4
+# Where V1, V2 and V3 end, in mm over the surface from the fundus of the calcarine sulcus.
+BORDERS = (0.0, 11.0, 18.0, 25.0)
+# Regions without data: (u, v, radius) in mm, as in `cortex`.
+HOLES = ((-9.0, 5.0, 3.0), (1.0, -7.0, 3.5), (-3.0, 15.0, 3.0), (13.0, 4.0, 2.5), (-8.0, -16.0, 3.5), (5.0, 21.0, 2.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +170,43 @@ def sulcus(
     return _phantom(gap / 2 - np.abs(s), np.where(s > 0, 100.0, 0.0), noise, seed)
 
 
+def cortex(size: int = 72, *, noise: float = 0.6, seed: int = 0) -> Phantom:
+    """A folded lobe, sulci 3 to 4 mm wide and 8 deep at size 72, with polar angle in degrees, 0..360, of three areas.
+
+    0 is the right horizontal meridian, 90 the upper vertical one, 270 the lower, as in a left hemisphere. Let v be the
+    distance over the surface from the fundus of the calcarine sulcus (above it v > 0) and u the place along it, in mm.
+    The angle is a for v < 0 and 360 - a for v > 0, where a rises from 0 to 90 up to |v| = 11 (V1), falls to 0 up to 18
+    (V2), and rises to 90 up to 25 (V3): at the borders fields mirror each other. Past u = 7 + 2 sin(v/3) lies a second
+    cluster, where upper and lower field change places: a border with jumps of 0 to 180 degrees. Values are NaN where
+    |v| > 25 or |u| > 17, and farther than 4 mm from the surface.
+
+    noise: s of arg(exp(i a) + s (n1 + i n2)) with n1 and n2 normal; 32 degrees in the mean at 0.6. Noisy data have
+    six holes 5 to 7 mm wide. Psi is the exact distance to its own mesh, up to 6 mm. The grid lies where an occipital
+    lobe does: left of x = 0 and behind y = 0 in RAS mm. Under a size of 56 sulci are too narrow for the voxels.
+    """
+    from beltrami_cli.distance import signed_distance
+    from beltrami_cli.levelset import zero_surface
+    from beltrami_cli.repair import repaired
+    from beltrami_cli.surface import Mesh
+
+    _require_noise(noise, seed)
+    x, mm = _centred(size, 3), size / 72
+    grid = Grid.from_spacing((size,) * 3)
+    surface = zero_surface(_lobe(x, mm), grid.spacing)
+    psi = signed_distance(repaired(Mesh(surface.points, surface.cells)), grid)
+
+    ribbon = np.abs(psi) < RIBBON * mm
+    u, v = _at_feet(surface, _places(surface, -x[:, 0, 0, 0], mm), np.argwhere(ribbon)).T
+    clean, noisy = np.full((2, *psi.shape), np.nan)
+    clean[ribbon] = np.where((np.abs(v) < BORDERS[-1]) & (np.abs(u) < 17), _polar_angle(u, v), np.nan)
+    parts = np.random.default_rng(seed).standard_normal((2, len(u)))
+    wave = np.exp(1j * np.deg2rad(clean[ribbon])) + noise * (parts[0] + 1j * parts[1])
+    in_hole = np.any([np.hypot(u - a, v - b) < radius for a, b, radius in HOLES], axis=0)
+    noisy[ribbon] = np.where(in_hole, np.nan, np.rad2deg(np.angle(wave)))
+    behind_left = Grid(grid.shape, np.array([[1.0, 0, 0, -size], [0, 1, 0, -size], [0, 0, 1, -size / 2], [0, 0, 0, 1]]))
+    return Phantom(psi, _turned(clean), _turned(noisy), behind_left)
+
+
 PHANTOMS: dict[str, Callable[..., Phantom]] = {
     "torus": torus,
     "sphere": sphere,
@@ -162,6 +214,7 @@ PHANTOMS: dict[str, Callable[..., Phantom]] = {
     "curve": curve,
     "portrait": portrait,
     "sulcus": sulcus,
+    "cortex": cortex,
 }
 
 
@@ -188,13 +241,17 @@ def _centred(size: int, dimensions: int, *, off_grid: float = OFF_GRID) -> np.nd
 
 def _phantom(psi: np.ndarray, clean: np.ndarray, noise: float, seed: int) -> Phantom:
     """float32 arrays on a grid of 1 mm; `noise` is the standard deviation in data units."""
+    _require_noise(noise, seed)
+    noisy = clean + noise * np.random.default_rng(seed).standard_normal(clean.shape)
+    single = np.float32
+    return Phantom(psi.astype(single), clean.astype(single), noisy.astype(single), Grid.from_spacing(psi.shape))
+
+
+def _require_noise(noise: float, seed: int) -> None:
     if not 0 <= noise < np.inf:
         raise RefusedError(f"noise of the phantom: found {noise:g}, expected a finite standard deviation of at least 0")
     if seed < 0:
         raise RefusedError(f"seed of the phantom: found {seed}, expected a whole number of at least 0")
-    noisy = clean + noise * np.random.default_rng(seed).standard_normal(clean.shape)
-    single = np.float32
-    return Phantom(psi.astype(single), clean.astype(single), noisy.astype(single), Grid.from_spacing(psi.shape))
 
 
 def _trefoil(t: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -228,3 +285,84 @@ def _nearest_on_ellipsoid(x: np.ndarray, axes: np.ndarray) -> np.ndarray:
         share = (a * x / (t + a**2)) ** 2
         t += (share.sum(0) - 1) / (2 * (share / (t + a**2)).sum(0))
     return a**2 * x / (t + a**2)
+
+
+def _lobe(x: np.ndarray, mm: float) -> np.ndarray:
+    """(n, n, n) in voxels: a function whose zero is a folded ellipsoid, |x| less the radius in that direction.
+
+    The radius is an ellipsoid's, lowered by depth * exp(-(s/width)^4) at s mm from the middle of a sulcus: the zero set
+    of a random wave, and the calcarine sulcus in a clearing of it. A little blur rounds what voxels cannot show.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    radius = np.sqrt((x**2).sum(0))
+    direction = x / radius
+    width, depth = SULCUS
+    u, s, front = _along_calcarine(direction)
+    clearing = front * np.exp(-((s / 7) ** 4) - (u / 20) ** 6)
+    folds = np.exp(-((LOBE.mean() * _wave_zero(direction) / width) ** 4)) * (1 - clearing)
+    calcarine = front * np.exp(-((s / width) ** 4) - (u / 18) ** 6)
+    lowered = 1 / np.sqrt(np.tensordot(1 / LOBE**2, direction**2, 1)) - depth * (folds + calcarine)
+    return gaussian_filter(np.clip(radius / mm - lowered, -3, 3), 0.7 * mm).astype(np.float32)
+
+
+def _along_calcarine(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of directions (3, ...), in mm on a sphere of the lobe's size: u along the sulcus, s across it (it winds), and
+    whether they are on its half."""
+    centre = np.array([3, -6, 1]) / np.sqrt(46)
+    along = np.array([2, 1, 0]) / np.sqrt(5)
+    u, s = (LOBE.mean() * np.tensordot(axis, direction, 1) for axis in (along, np.cross(centre, along)))
+    return u, s + 2.5 * np.sin(u / 6), np.tensordot(centre, direction, 1) > 0
+
+
+def _wave_zero(direction: np.ndarray) -> np.ndarray:
+    """Of directions (3, ...): about how far, in radians, the zero of a wave is, f / |grad f|.
+
+    f is the sum of 30 plane waves from all sides: those of a Fibonacci lattice, of phases without an order.
+    """
+    k = np.arange(30) + 0.5
+    z, turn = 1 - k / 15, np.pi * (1 + np.sqrt(5)) * k
+    f, slope = np.zeros(direction.shape[1:]), np.zeros(direction.shape)
+    for j, axis in enumerate(np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], 1)):
+        phase = FOLDING * np.tensordot(axis, direction, 1) + 2.4 * j**2
+        f += np.cos(phase)
+        slope -= FOLDING * np.multiply.outer(axis, np.sin(phase))
+    slope -= (slope * direction).sum(0) * direction
+    # The second term keeps the quotient small where the wave has its crests, without a slope.
+    return f / np.sqrt((slope**2).sum(0) + 0.3 * (FOLDING * f) ** 2)
+
+
+def _places(surface: ZeroSurface, centre: np.ndarray, mm: float) -> np.ndarray:
+    """(V, 2) u and v of `cortex`, in mm, at the vertices; `centre` (3,) of the lobe, in voxels."""
+    from beltrami_cli.geodesic import distance_over
+
+    rays = (surface.points - centre).T
+    u, s, front = _along_calcarine(rays / np.sqrt((rays**2).sum(0)))
+    fundus = np.flatnonzero((np.abs(s) < 0.6 / mm) & (np.abs(u) < 19) & front)  # a chain of vertices, one voxel apart
+    v = np.sign(s) * distance_over(surface, fundus, np.inf) / mm
+    return np.stack([np.where(front, u, np.inf), v], 1)
+
+
+def _at_feet(surface: ZeroSurface, values: np.ndarray, voxels: np.ndarray) -> np.ndarray:
+    """(N, K) values (V, K) of the vertices, at the surface points nearest to voxels (N, 3)."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(surface.points)
+    nearest = tree.query(voxels)[1]
+    normal = surface.normals[nearest]
+    feet = voxels - ((voxels - surface.points[nearest]) * normal).sum(1, keepdims=True) * normal
+    off, near = tree.query(feet, 4)
+    weights = 1 / (off**2 + 1e-6)
+    return np.asarray((values[near] * (weights / weights.sum(1, keepdims=True))[:, :, None]).sum(1))
+
+
+def _polar_angle(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Degrees, -90..90, at the places u and v in mm: see `cortex`."""
+    folded = np.interp(np.abs(v), BORDERS, (0, 90, 0, 90))
+    return np.where(v < 0, folded, -folded) * np.where(u < 7 + 2 * np.sin(v / 3), 1, -1)
+
+
+def _turned(angle: np.ndarray) -> np.ndarray:
+    """float32 degrees in [0, 360)."""
+    single = (angle % 360).astype(np.float32)
+    return np.where(single == 360, np.float32(0), single)

@@ -8,11 +8,14 @@ from scipy.ndimage import map_coordinates
 from beltrami_cli import phantoms
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.formats import read_volume
+from beltrami_cli.levelset import zero_surface
+from beltrami_cli.surface import edge_counts, edges_of
 
 DISTANCES = ["torus", "sphere", "plane", "curve", "portrait"]
+ADDITIVE = [*DISTANCES, "sulcus"]
 
 
-@pytest.mark.parametrize("name", phantoms.PHANTOMS)
+@pytest.mark.parametrize("name", ADDITIVE)
 def test_arrays_share_a_grid_and_noise_has_its_size(name):
     phantom = phantoms.make(name, noise=7.0, seed=3)
     shape = phantom.clean.shape
@@ -29,9 +32,9 @@ def test_arrays_share_a_grid_and_noise_has_its_size(name):
 @pytest.mark.parametrize("name", phantoms.PHANTOMS)
 def test_seed_decides_the_noise(name):
     first, again, other = (phantoms.make(name, size=24, seed=seed) for seed in (1, 1, 2))
-    assert np.array_equal(first.noisy, again.noisy)
-    assert not np.array_equal(first.noisy, other.noisy)
-    assert np.array_equal(first.clean, other.clean)
+    assert np.array_equal(first.noisy, again.noisy, equal_nan=True)
+    assert not np.array_equal(first.noisy, other.noisy, equal_nan=True)
+    assert np.array_equal(first.clean, other.clean, equal_nan=True)
 
 
 @pytest.mark.parametrize("name", DISTANCES)
@@ -124,6 +127,105 @@ def test_sulcus_has_two_banks_at_the_gap(gap, direction):
     assert np.count_nonzero(phantom.levelset > 0) == pytest.approx(gap * 48**2 / axis.max(), rel=0.35)
 
 
+@pytest.fixture(scope="module")
+def cortex():
+    return phantoms.cortex()
+
+
+def turn(a, b):
+    """Degrees from b to a, the shorter way round."""
+    return (a.astype(float) - b + 180) % 360 - 180
+
+
+def test_cortex_is_one_folded_sphere_at_a_signed_distance(cortex):
+    psi = cortex.levelset
+    surface = zero_surface(psi, np.ones(3))
+    edges = len(edges_of(surface.cells))
+    assert (edge_counts(surface.cells)[1] == 2).all()
+    assert len(surface.points) - edges + len(surface.cells) == 2 and len(np.unique(surface.piece)) == 1
+    corners = surface.points[surface.cells]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    # The lobe's ellipsoid has 8,000 mm^2.
+    assert 13_000 < area < 20_000
+    slope = np.sqrt(sum(d**2 for d in np.gradient(psi.astype(float))))
+    assert np.median(np.abs(slope - 1)[np.abs(psi) < 3]) < 0.02
+    assert np.abs(psi).max() == 6
+    low, high = cortex.grid.affine[:3, 3], cortex.grid.affine[:3, 3] + 71
+    assert high[0] < 0 and high[1] < 0 and low[2] < 0 < high[2]
+
+
+def test_cortex_has_sulci_of_a_few_voxels(cortex):
+    """What a ball of 4 voxels cannot enter from outside lies within the sulci."""
+    from scipy.ndimage import binary_closing, distance_transform_edt
+
+    inside = cortex.levelset < 0
+    x = np.indices((9, 9, 9)) - 4
+    closed = binary_closing(np.pad(inside, 8), (x**2).sum(0) <= 16)[8:-8, 8:-8, 8:-8]
+    within = closed & ~inside
+    assert within.sum() > 0.15 * inside.sum()
+    depth = distance_transform_edt(closed)[within]
+    assert 6 < depth.max() < 12
+    # From the middle of a sulcus it is half its width to the nearest wall.
+    assert 1.0 < np.percentile(cortex.levelset[within], 90) < 2.5
+
+
+def test_cortex_map_is_that_of_a_left_hemisphere(cortex):
+    clean = cortex.clean
+    known = np.isfinite(clean)
+    assert np.abs(turn(clean[known], 0)).max() <= 90 and clean[known].min() >= 0 and clean[known].max() < 360
+    assert np.all(np.abs(cortex.levelset[known]) < 4)
+    # Over 2,000 mm^2 of surface; the upper field lies mostly below the lower one.
+    assert np.count_nonzero(known & (np.abs(cortex.levelset) < 0.5)) > 2000
+    first = known.copy()
+    first[np.argwhere(known)[:, 0].mean().astype(int) :] = False  # the cluster nearer to the pole
+    z = np.argwhere(first)[:, 2]
+    assert z[clean[first] > 180].mean() > z[clean[first] < 180].mean() + 8
+
+
+def test_cortex_fields_mirror_each_other_and_jump_at_one_border(cortex):
+    folded = np.rad2deg(np.arccos(np.cos(np.deg2rad(phantoms._polar_angle(0.0, np.linspace(0, 25, 26))))))
+    assert np.abs(folded[[0, 11, 18, 25]] - [0, 90, 0, 90]).max() < 1e-9
+    assert phantoms._polar_angle(0.0, -5.5) == 45 and phantoms._polar_angle(0.0, 5.5) == -45
+    assert phantoms._polar_angle(16.0, -5.5) == -45
+    near = np.abs(cortex.levelset) < 0.5
+    steps = np.abs(turn(cortex.clean[1:], cortex.clean[:-1]))[near[1:] & near[:-1]]
+    steps = steps[np.isfinite(steps)]
+    # A map with a border, not a patchwork: slopes of about 10 degrees per mm but for a few percent.
+    assert np.median(steps) < 8 and 0.01 < np.mean(steps > 60) < 0.06
+
+
+def test_cortex_clean_values_are_constant_along_normals(cortex):
+    psi, clean = cortex.levelset.astype(float), cortex.clean
+    x = np.argwhere((np.abs(psi) < 2) & np.isfinite(clean)).T
+    normal = np.array(np.gradient(psi))[(slice(None), *x)]
+    foot = np.round(x - psi[tuple(x)] * normal / np.linalg.norm(normal, axis=0)).astype(int)
+    gap = np.abs(turn(clean[tuple(foot)], clean[tuple(x)]))
+    # The voxel nearest to the foot is up to 0.9 mm away, in a map of about 10 degrees per mm.
+    assert np.nanmedian(gap) < 4 and np.nanpercentile(gap, 90) < 12
+
+
+def test_cortex_noise_is_that_of_a_complex_signal(cortex):
+    error = turn(cortex.noisy, cortex.clean)
+    error = error[np.isfinite(error)]
+    n = np.random.default_rng(5).standard_normal((2, 200_000))
+    expected = np.abs(np.rad2deg(np.arctan2(0.6 * n[0], 1 + 0.6 * n[1]))).mean()
+    assert abs(np.abs(error).mean() - expected) < 0.8 and abs(error.mean()) < 1
+    quiet = phantoms.cortex(24, noise=0.0)
+    there = np.isfinite(quiet.noisy)
+    assert np.abs(turn(quiet.noisy[there], quiet.clean[there])).max() < 1e-3
+
+
+def test_cortex_has_holes_in_the_noisy_map_only(cortex):
+    from scipy.ndimage import label
+
+    missing = np.isfinite(cortex.clean) & np.isnan(cortex.noisy)
+    assert not np.any(np.isnan(cortex.clean) & np.isfinite(cortex.noisy))
+    assert 0.05 < missing.sum() / np.isfinite(cortex.clean).sum() < 0.15
+    parts = label(missing, np.ones((3, 3, 3)))[0]
+    sizes = np.bincount(parts.ravel())[1:]
+    assert np.count_nonzero(sizes > 60) in (5, 6, 7), sizes
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -134,6 +236,8 @@ def test_sulcus_has_two_banks_at_the_gap(gap, direction):
         (lambda: phantoms.make("plane", size=16, noise=-1), "found -1"),
         (lambda: phantoms.make("plane", size=16, noise=float("nan")), "found nan"),
         (lambda: phantoms.make("plane", size=16, seed=-1), "found -1"),
+        (lambda: phantoms.cortex(24, noise=-1), "found -1"),
+        (lambda: phantoms.cortex(8), "found 8, expected 16 to 512"),
         (lambda: phantoms.sulcus(gap=0), "found 0, expected a width"),
     ],
 )
@@ -164,3 +268,10 @@ def test_command_writes_colours(tmp_path):
     done("phantom", "portrait", tmp_path, "--size", "16", "--map", "rgb")
     assert read_volume(tmp_path / "noisy.nii.gz", channels=True).data.shape == (16, 16, 16, 3)
     assert "belongs to the phantom torus" in refused("phantom", "portrait", tmp_path / "x", "--map", "pieces")
+
+
+def test_command_writes_the_cortex_where_it_lies(tmp_path):
+    done("phantom", "cortex", tmp_path, "--size", "24", "--noise", "0.3")
+    noisy = read_volume(tmp_path / "noisy.nii.gz")
+    assert noisy.grid.affine[:3, 3].tolist() == [-24, -24, -12]
+    assert np.nanmax(noisy.data) < 360 and 100 < np.isfinite(noisy.data).sum() < 3000

@@ -10,7 +10,7 @@ import click
 from beltrami_cli.cli.common import Command, overwrite_option, say
 from beltrami_cli.errors import RefusedError
 
-NAMES = ("torus", "sphere", "plane", "curve", "portrait", "sulcus")
+NAMES = ("torus", "sphere", "plane", "curve", "portrait", "sulcus", "cortex")
 MAPS = {"torus": ("mixed", "pieces", "smooth", "angle"), "portrait": ("grey", "rgb")}
 
 
@@ -19,7 +19,10 @@ MAPS = {"torus": ("mixed", "pieces", "smooth", "angle"), "portrait": ("grey", "r
 @click.argument("outdir", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--size", type=int, metavar="N", help="Voxels along each axis; the default depends on the phantom.")
 @click.option(
-    "--noise", type=float, metavar="SIGMA", help="Standard deviation per voxel; the default depends likewise."
+    "--noise",
+    type=float,
+    metavar="SIGMA",
+    help="Standard deviation per voxel (cortex: of both parts of a wave of height 1); the default depends likewise.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the noise.")
 @click.option("--format", "suffix", type=click.Choice(["nii.gz", "mha", "npy"]), default="nii.gz", show_default=True)
