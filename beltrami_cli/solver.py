@@ -33,11 +33,12 @@ from beltrami_cli.planning import CORRELATED, Plan, Planner, Sample
 from beltrami_cli.progress import Phases
 from beltrami_cli.record import Ran, over_frames, what_happened
 from beltrami_cli.sampling import SurfacePoints, own_vertices, surface_mesh, vertices_of
-from beltrami_cli.surface import Mesh, faces_inwards
+from beltrami_cli.surface import Mesh, edges_of, faces_inwards
 from beltrami_cli.tuning import discrepancy
 
 # Parts of the surface without data are worth a warning above this share of the band: below it are lone voxels.
 LONE_SHARE = 1e-3
+SPECK = 3  # edges: parts of a surface without a voxel of their own are hardly wider, and holes worth the name are
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,10 +185,11 @@ class Solver:
         if self.settings.flat:
             return None
         observed = self._observed(data, Warnings(None))
-        channels = observed.values
+        channels, kind = observed.values, observed.kind
         if not isinstance(observed, AtVertices):
-            channels = self.shown[0][1](channels, turns=observed.kind.turns)
-        return observed.kind.at_vertices(channels)
+            mesh, points = self.shown[0]
+            channels = _without_specks(mesh, points(channels, turns=kind.turns))
+        return kind.at_vertices(channels)
 
     def denoise_series(self, data: np.ndarray, observer: Observer | None = None) -> Result:
         """Denoise every frame of data, one channel's shape + (K,), on its own."""
@@ -338,6 +340,24 @@ class Solver:
         at = [np.full((1, len(mesh.vertices_ras_mm)), np.nan, data.dtype) for mesh, _ in self.shown]
         out = self.places.give(values, at, Kind(), data)
         return self._result(out, [channels[0] for channels in at], np.zeros(data.shape, bool), {})
+
+
+def _without_specks(mesh: Mesh, channels: np.ndarray) -> np.ndarray:
+    """Channels (K, V), a vertex that lacks a value taking the mean of its neighbours, where most of them have one.
+
+    In a tight sulcus the voxels around a vertex may all belong to the other bank.
+    """
+    edges = edges_of(mesh.cells) if mesh.cells.shape[1] == 3 else mesh.cells
+    ends, others, count = edges.ravel(), edges[:, ::-1].ravel(), channels.shape[1]
+    neighbours = np.bincount(ends, minlength=count)
+    for _ in range(SPECK):
+        lost = np.isnan(channels[0])
+        known = np.bincount(ends, ~lost[others], minlength=count)
+        specks = lost & (2 * known > neighbours)
+        for channel in channels:
+            sums = np.bincount(ends, np.where(lost, 0, channel)[others], count)
+            channel[specks] = sums[specks] / known[specks]
+    return channels
 
 
 class _NoiseWatch:

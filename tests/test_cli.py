@@ -25,8 +25,10 @@ from beltrami_cli.cli import beltrami as group
 OPTIONS = {
     "denoise": "-o --mesh --no-mesh --flow --phi --beta --eps --scheme --iterations --time --fwhm --dt --extension "
     "--extend-every --band --spacing --resample --inside --outside --precision --config --threads --flat --overwrite "
-    "--on --labels --between --map --frame --structure --memory",
-    "batch": "--jobs --scheduler --resume --dry-run --summary --part --threads --memory --retries --overwrite",
+    "--on --labels --between --map --frame --structure --memory --report",
+    "batch": "--jobs --scheduler --resume --dry-run --summary --report --part --threads --memory --retries --overwrite",
+    "view": "-o --levelset --compare --titles --period --missing --map --labels --between --inside --spacing --resample "
+    "--frame --overwrite",
     "levelset": "-o --labels --between --like --spacing --margin --frame --overwrite",
     "sample": "-o --kind --period --missing --frame --structure --spacing --overwrite",
     "mesh": "-o --spacing --resample --inside --overwrite",
@@ -39,7 +41,7 @@ OPTIONS = {
 CHOICES = {
     "denoise": "beltrami l2 l1 tv phi charbonnier perona-malik geman-mcclure weickert symmetric paper "
     "closest-point pde none negative positive nan zero keep float32 float64",
-    "phantom": "torus sphere plane curve portrait sulcus nii.gz mha npy",
+    "phantom": "torus sphere plane curve portrait sulcus cortex nii.gz mha npy",
 }
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import reference
@@ -543,3 +546,14 @@ def test_closest_points_on_a_quadric(curvatures):
         outward /= np.linalg.norm(outward)
         assert abs(distance[e] - (x_own[e] - foot) @ outward) < 0.02
         assert np.linalg.norm(frame @ normal[:, e] - outward) < 0.03
+
+
+def test_nowhere_to_keep_compiled_kernels_is_told():
+    script = (
+        "from numba.core import caching; caching.CacheImpl._locator_classes.clear();"
+        "from beltrami_cli.cli import main; raise SystemExit(main(['denoise', '--flat', 'a.npy', '-o', 'b.npy']))"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.returncode == 2
+    assert run.stderr.startswith("beltrami: compiled kernels can be kept nowhere")
+    assert run.stderr.rstrip().endswith("set NUMBA_CACHE_DIR to a folder that can be written to")

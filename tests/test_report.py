@@ -1,155 +1,433 @@
-"""Pictures: what is drawn, by its colours; where the camera stands; the order of a curve."""
+"""Pictures, by their colours and their words: what hides what, what is grey, the order of a curve, sheets."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from beltrami_cli.errors import RefusedError
-from beltrami_cli.report.drawing import (
-    DENOISED,
-    INPUT,
-    MISSING,
-    THREE_QUARTER,
-    TRUTH,
-    _along,
-    _area_vectors,
-    _camera,
-    _colour_range,
-    _vertex_normals,
-    draw_before_after,
-)
+from beltrami_cli import report
+from beltrami_cli.errors import DataError, RefusedError
+from beltrami_cli.grid import Grid
+from beltrami_cli.report import drawing, sheet
+from beltrami_cli.report.colours import MISSING, Scale
+from beltrami_cli.report.drawing import DENOISED, INPUT, TRUTH
+from beltrami_cli.report.geometry import View
+from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.surface import Mesh
 
 # A square in the plane z = 0, facing up; seen face on, its colours are not dimmed.
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 TWO = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+ABOVE = View("above", np.eye(3))
 VIRIDIS = colormaps["viridis"]
 
+RECORD = {
+    "Parameters": {"flow": "beltrami", "beta": 0.1, "phi": None, "depth": [-2.0, 2.0]},
+    "Iterations": 2,
+    "StopReason": "iterations",
+    "Noise": {"sd": [2.0], "after": [0.5]},
+    "Smoothness": {"before_mm": 1.0, "after_mm": 4.0},
+    "Removed": {"rms": 1.5},
+    "Choice": {"iterations": 2, "errors": [3.0, 2.0, 1.0, 1.5]},
+    "PerIteration": {
+        "beta": [0.1, 0.2],
+        "dt_over_beta": [1.5, None],
+        "change_rms": [1.0, 0.01],
+        "noise_sd": [{"iteration": 0, "sd": [2.0]}, {"iteration": 2, "sd": [0.5]}],
+    },
+    "Warnings": ["the first", "the second"],
+    "Seconds": {"read": 1.0, "flow": 2.0},
+}
 
-def share(path, colour) -> float:
-    """Share of the picture's coloured pixels that have this colour, within one step of 255."""
-    pixels = imread(path)[..., :3].reshape(-1, 3)
-    coloured = pixels[np.ptp(pixels, axis=1) > 0.1]
-    where = pixels if np.ptp(colour[:3]) == 0 else coloured
-    return float((np.abs(where - colour[:3]).max(1) < 1.5 / 255).mean())
 
-
-def squares(*heights: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of parallel squares at these z."""
+def squares(*heights: float) -> Mesh:
+    """Parallel squares at these z."""
     vertices = np.concatenate([SQUARE + np.array([0, 0, z]) for z in heights])
-    return vertices, np.concatenate([TWO + 4 * k for k in range(len(heights))])
+    return Mesh(vertices, np.concatenate([TWO + 4 * k for k in range(len(heights))]))
+
+
+def loop(n: int = 60) -> Mesh:
+    turn = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    vertices = np.stack([8 + 5 * np.cos(turn), 8 + 5 * np.sin(turn), 0 * turn], 1)
+    return Mesh(vertices, np.stack([np.arange(n), (np.arange(n) + 1) % n], 1))
+
+
+def box(n: int = 12) -> Mesh:
+    from skimage.measure import marching_cubes
+
+    ball = np.linalg.norm(np.stack(np.meshgrid(*[np.arange(n) - (n - 1) / 2] * 3)), axis=0) - n / 3
+    vertices, cells, *_ = marching_cubes(ball, 0.0)
+    return Mesh(vertices.astype(float), cells)
+
+
+def run_on(mesh: Mesh | None, grid: Grid | None = None, **changes: object) -> Subject:
+    """A run whose input is twice as rough as its output, on a mesh, a grid or both; the first fifth is filled in."""
+    rng = np.random.default_rng(0)
+    values = None if mesh is None else rng.normal(5, 1, len(mesh.vertices_ras_mm))
+    volume = None if grid is None else rng.normal(5, 1, grid.shape)
+    filled = None if values is None else np.arange(len(values)) < len(values) / 5
+    before = Map("before", None if values is None else np.where(filled, np.nan, values), volume)
+    after = Map("after", None if values is None else values / 2, None if volume is None else volume / 2, filled)
+    return replace(Subject("a run", (before, after), mesh, grid, is_run=True, record=RECORD), **changes)
+
+
+def saved(tmp_path, figure: Figure) -> np.ndarray:
+    """(rows, columns, 3) pixels from 0 to 1."""
+    figure.savefig(tmp_path / "figure.png", dpi=100)
+    return imread(tmp_path / "figure.png")[..., :3]
+
+
+def share(pixels: np.ndarray, colour: object) -> float:
+    """Share of pixels that have this colour, within two steps of 255."""
+    return float((np.abs(pixels - np.array(colour)[:3]).max(-1) < 2.5 / 255).mean())
+
+
+def words(subject: Subject, tmp_path, monkeypatch) -> str:
+    """All that is written on the sheet of a subject."""
+    from matplotlib.text import Text
+
+    found = []
+    savefig = Figure.savefig
+
+    def noted(figure: Figure, *args: object, **options: object) -> None:
+        savefig(figure, *args, **options)
+        found.extend(text.get_text() for text in figure.findobj(Text) if text.get_visible())
+
+    monkeypatch.setattr(Figure, "savefig", noted)
+    sheet.draw(tmp_path / "sheet.png", subject)
+    return "\n".join(text for text in found if text)
+
+
+# Surfaces
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_nearer_surface_hides_the_farther(tmp_path, order):
-    vertices, cells = squares(0.0, 1.0)
-    values = np.repeat([0.0, 1.0], 4)
-    draw_before_after(tmp_path / "a.png", Mesh(vertices, cells[::order]), values, values)
-    assert share(tmp_path / "a.png", VIRIDIS(1.0)) > 0.8  # the rest is the colour bar
-    assert share(tmp_path / "a.png", VIRIDIS(0.0)) < 0.05
+    mesh = squares(0.0, 1.0)
+    mesh = replace(mesh, cells=mesh.cells[::order])
+    figure = Figure(figsize=(2, 2))
+    colours = Scale(0, 1).rgba(np.repeat([0.0, 1.0], 4))
+    drawing.surface(figure.add_axes((0, 0, 1, 1)), mesh, colours, ABOVE)
+    pixels = saved(tmp_path, figure)
+    assert share(pixels, VIRIDIS(1.0)) > 0.9
+    assert share(pixels, VIRIDIS(0.0)) == 0
 
 
-def test_both_panels_share_one_scale_and_missing_is_grey(tmp_path):
-    vertices, cells = squares(0.0)
-    mesh = Mesh(np.concatenate([vertices, vertices + np.array([2, 0, 0])]), np.concatenate([cells, cells + 4]))
-    after = np.repeat([0.0, 1.0], 4)
-    before = np.repeat([np.nan, 5.0], 4)  # over the scale, so drawn as its upper end
-    before[:2] = np.inf
-    draw_before_after(tmp_path / "a.png", mesh, before, after)
-    assert share(tmp_path / "a.png", np.array(MISSING)) > 0.08
-    assert _colour_range(np.full(8, np.nan), after) == (0.0, 1.0)
-    # Two squares of value 1 or more, and one of 0 that `after` alone knows.
-    assert share(tmp_path / "a.png", VIRIDIS(1.0)) > 0.5
-    assert 0.2 < share(tmp_path / "a.png", VIRIDIS(0.0)) < 0.45
+def test_sides_turn_darker_and_a_box_shows_a_part(tmp_path):
+    mesh = squares(0.0)
+    slanted = View("slanted", np.array([[1.0, 0, 0], [0, 0.5, 0.75**0.5], [0, -(0.75**0.5), 0.5]]))
+    for view, light in ((ABOVE, 1.0), (slanted, drawing.AMBIENT + (1 - drawing.AMBIENT) / 2)):
+        figure = Figure(figsize=(2, 2))
+        colours = np.full((4, 4), [1.0, 0, 0, 1])
+        drawing.surface(figure.add_axes((0, 0, 1, 1)), mesh, colours, view, box=np.array([[0.0, 0], [0.4, 0.4]]))
+        assert share(saved(tmp_path, figure), (light, 0, 0)) > 0.9
 
 
-def test_a_surface_without_any_value_is_drawn_grey(tmp_path):
-    vertices, cells = squares(0.0)
-    nothing = np.full(4, np.nan)
-    draw_before_after(tmp_path / "a.png", Mesh(vertices, cells), nothing, nothing)
-    assert share(tmp_path / "a.png", np.array(MISSING)) > 0.5
+def test_filled_places_are_outlined(tmp_path):
+    n = 41
+    x, y = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    k = (x[:-1, :-1] * n + y[:-1, :-1]).ravel()
+    cells = np.concatenate([np.stack([k, k + n, k + n + 1], 1), np.stack([k, k + n + 1, k + 1], 1)])
+    mesh = Mesh(np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(float), cells)
+    filled = ((np.abs(x - 20) < 8) & (np.abs(y - 20) < 8)).ravel()
+    colours = np.full((n * n, 4), [1.0, 0, 0, 1])
+    figure = Figure(figsize=(4, 4))
+    axes = figure.add_axes((0, 0, 1, 1))
+    drawing.surface(axes, mesh, colours, ABOVE, filled)
+    pixels = saved(tmp_path, figure)
+    rows, columns = np.nonzero(pixels.max(-1) < 0.2)  # black
+    # 15.5 of 40 mm of 400 pixels.
+    assert np.ptp(rows) == pytest.approx(155, abs=8) and np.ptp(columns) == pytest.approx(155, abs=8)
+    assert share(pixels[190:210, 190:210], (1, 0, 0)) == 1
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "expected"),
-    [
-        ([0.0, 100.0], [2.0, 4.0], (2.04, 3.96)),  # noise in the input does not flatten the result
-        ([np.nan, 1.0, 9.0], [50.0, 2.0, 4.0], (2.04, 3.96)),  # nor does what was filled in
-        ([1.0, 2.0], [3.0, 3.0], (1.02, 1.98)),
-        ([7.0, 7.0], [7.0, 7.0], (0.0, 1.0)),
-        ([np.nan], [np.nan], (0.0, 1.0)),
-    ],
-)
-def test_colour_range(before, after, expected):
-    assert _colour_range(np.array(before), np.array(after)) == pytest.approx(expected)
+def test_the_letters_of_a_view():
+    axes = Figure().add_subplot()
+    drawing.directions(axes, View("lateral", np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])))
+    at = {text.get_text(): text.get_position() for text in axes.texts}
+    assert at["A"][0] < 0 and at["P"][0] > 1  # anterior is on the left
+    assert at["S"][1] > 1 and at["I"][1] < 0
 
 
-def test_camera():
-    up = _camera(np.array([[0.0, 0.0, 2.0]]))
-    assert np.allclose(up, np.eye(3))  # from above: left is left and anterior is up
-    for towards in (*np.eye(3), *-np.eye(3), [0.3, -0.5, 0.2]):
-        frame = _camera(np.atleast_2d(towards))
-        assert np.allclose(frame @ frame.T, np.eye(3))
-        assert np.linalg.det(frame) == pytest.approx(1.0)
-        assert np.allclose(frame[2], towards / np.linalg.norm(towards))
-    assert np.allclose(_camera(np.array([[0.0, 0, 1], [0, 0, -1]]))[2], THREE_QUARTER / np.linalg.norm(THREE_QUARTER))
-
-
-def test_normals():
-    vertices, cells = squares(0.0)
-    area = _area_vectors(vertices, cells)
-    assert np.allclose(area, [[0, 0, 0.5]] * 2)
-    assert np.allclose(_vertex_normals(area, cells, 5), [[0, 0, 1]] * 4 + [[0, 0, 0]])
+# Curves
 
 
 def test_the_order_along_curves():
     # A loop 0-1-2-3 and an open part 4-5-6, segments in any order.
     vertices = np.concatenate([SQUARE, [[5.0, 0, 0], [5, 2, 0], [5, 2, 3]]])
     cells = np.array([[5, 6], [2, 3], [0, 1], [3, 0], [4, 5], [1, 2]], np.int32)
-    order, arc = _along(Mesh(vertices, cells))
+    order, arc = drawing.along(Mesh(vertices, cells))
     assert order.tolist() == [4, 5, 6, -1, 0, 1, 2, 3, 0]
     assert arc.tolist() == [0, 2, 5, 5, 5, 6, 7, 8, 9]
 
 
-def test_curve(tmp_path):
-    turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    loop = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
-    mesh = Mesh(loop, np.stack([np.arange(60), (np.arange(60) + 1) % 60], 1))
-    clean = 10 * np.cos(3 * turn)
-    draw_before_after(tmp_path / "c.png", mesh, clean + 20, clean, truth=clean - 20)
-    pixels = imread(tmp_path / "c.png")[200:, :, :3]  # below the legend
-    rows = [
-        np.median(np.nonzero(np.abs(pixels - to_rgb(colour)).max(-1) < 0.02)[0]) for colour in (TRUTH, DENOISED, INPUT)
+def test_the_roughest_line_is_at_the_back():
+    mesh = loop()
+    rough, smooth = np.random.default_rng(0).normal(0, 1, 60), np.cos(np.arange(60) / 9)
+    figure = Figure()
+    drawing.curve(
+        figure, Subject("c", tuple(Map(*m) for m in (("true", smooth), ("noisy", rough), ("flat", 0 * rough))), mesh)
+    )
+    (axes,) = figure.axes
+    lines = {line.get_label(): line for line in axes.get_lines()}
+    assert lines["noisy"].get_zorder() < lines["true"].get_zorder() < lines["flat"].get_zorder()
+    assert [lines[name].get_color() for name in ("true", "noisy", "flat")] == [TRUTH, INPUT, DENOISED]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["true", "noisy", "flat"]
+
+
+def test_a_curve_of_angles_is_not_joined_across_the_wrap():
+    angles = (350 + np.arange(60)) % 360.0
+    figure = Figure()
+    one = Map("a", angles)
+    drawing.curve(figure, Subject("c", (one, one), loop(), period=360.0, is_run=True))
+    for line in figure.axes[0].get_lines():
+        drawn = np.asarray(line.get_ydata())
+        assert np.nanmax(np.abs(np.diff(drawn))) < 180
+        assert np.isnan(drawn).sum() == 2  # at 360, and where the loop closes from 49 to 350
+    assert [line.get_color() for line in figure.axes[0].get_lines()] == [INPUT, DENOISED]
+
+
+# Slices
+
+
+def test_slices_show_values_where_they_are(tmp_path):
+    grid = Grid((10, 20, 30), np.diag([2.0, 1, 1, 1]))
+    volume = np.full(grid.shape, np.nan)
+    volume[5, 10:, :] = 1.0
+    figure = Figure(figsize=(9, 4))
+    subject = Subject("s", (Map("a", None, volume),), None, grid)
+    drawing.slices(figure, subject, Scale(0, 1))
+    sagittal, coronal, axial = figure.axes
+    assert [axes.get_title() for axes in figure.axes] == [
+        "sagittal, x = 10 mm",
+        "coronal, y = 10 mm",
+        "axial, z = 15 mm",
     ]
-    assert rows[0] > rows[1] > rows[2]  # as the values do; row 0 is the top
+    assert sagittal.get_xlim() == (9.5, 19.5) and sagittal.get_ylim() == (-0.5, 29.5)  # cut to what is known
+    assert axial.get_xlim() == (9.0, 11.0)
+    assert {text.get_text() for text in coronal.texts} == {"L", "R", "I", "S"}
+    assert share(saved(tmp_path, figure), VIRIDIS(1.0)) > 0.1
 
 
-def test_values_that_do_not_belong_to_the_mesh(tmp_path):
-    vertices, cells = squares(0.0)
-    with pytest.raises(ValueError, match="input: expected 4 values"):
-        draw_before_after(tmp_path / "a.png", Mesh(vertices, cells), np.zeros(3), np.zeros(4))
+def test_slices_of_a_run_show_what_was_removed(tmp_path):
+    subject = run_on(box(), Grid.from_spacing((12, 12, 12)))
+    figure = Figure(figsize=(8, 8))
+    drawing.slices(figure, subject)
+    names = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert [name for name in names if len(name) > 1] == ["before", "after", "removed"]
+    assert len(figure.axes[0].collections) == 2  # the outline and its casing
+    assert drawing.slices_height(subject, 8.0) > drawing.slices_height(replace(subject, is_run=False), 8.0)
 
 
-def test_missing_matplotlib_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    vertices, cells = squares(0.0)
-    with pytest.raises(RefusedError, match=r"pip install 'beltrami_cli\[report\]'"):
-        draw_before_after(tmp_path / "a.png", Mesh(vertices, cells), np.zeros(4), np.zeros(4))
+def test_slices_cut_where_the_data_are():
+    mesh = box(30)
+    grid = Grid.from_spacing((30, 30, 30))
+    values = np.where(mesh.vertices_ras_mm[:, 0] > 20, 1.0, np.nan)
+    cuts = drawing.cuts_of(Subject("s", (Map("a", values, np.ones(grid.shape)),), mesh, grid))
+    assert cuts.index[0] > 20 and abs(cuts.index[1] - 14.5) < 2
+    assert (cuts.box[0] <= 2).all() and (cuts.box[1] >= 27).all()
+
+
+def test_without_a_volume_the_outline_has_the_colours(tmp_path):
+    mesh = box(30)
+    subject = Subject("s", (Map("a", np.ones(len(mesh.vertices_ras_mm))),), mesh)
+    figure = Figure(figsize=(9, 4))
+    drawing.slices(figure, subject, Scale(0, 1))
+    assert share(saved(tmp_path, figure), VIRIDIS(1.0)) > 0.002
+    assert share(saved(tmp_path, figure), MISSING) < 0.001
+
+
+# Histograms, courses, the key
+
+
+def test_histograms_count_what_both_maps_have():
+    figure = Figure(figsize=(6, 2))
+    before, after = Map("before", np.array([1.0, 2, np.nan, 4])), Map("after", np.array([1.0, 2, 3, 1]))
+    drawing.histograms(figure, Subject("s", (before, after), is_run=True))
+    values, removed = figure.axes
+    assert values.get_title() == "values (3 vertices)"
+    assert removed.get_title() == "removed (vertices): rms 1.73"
+
+
+def test_courses_over_the_iterations():
+    figure = Figure(figsize=(10, 2))
+    assert drawing.has_iterations(RECORD) and drawing.courses(RECORD) == 5
+    drawing.iterations(figure, RECORD)
+    at = {axes.get_title(): axes for axes in figure.axes}
+    assert list(at) == ["change, rms", "noise, sd", "held-out error, rms", "beta (mm per unit)", "dt / beta"]
+    assert at["change, rms"].get_yscale() == "log" and at["beta (mm per unit)"].get_yscale() == "linear"
+    assert at["change, rms"].get_lines()[0].get_xdata().tolist() == [1, 2]
+    assert at["noise, sd"].get_lines()[0].get_xdata().tolist() == [0, 2]
+    assert at["held-out error, rms"].get_lines()[0].get_xdata().tolist() == [0, 1, 2, 3]
+    assert at["held-out error, rms"].texts[0].get_text() == "chosen: 2"
+
+
+@pytest.mark.parametrize(
+    ("record", "expected"),
+    [
+        (None, 0),
+        ({}, 0),
+        ({"PerIteration": None, "Noise": None, "Choice": None, "Iterations": 0}, 0),
+        ({"Noise": {"sd": [None], "after": [None]}, "Iterations": 3}, 0),
+        ({"Noise": {"sd": [2.0], "after": [1.0]}, "Iterations": 3}, 1),
+        ({"PerIteration": {"beta": [0.1], "change_rms": [], "noise_sd": [{"iteration": 0, "sd": [None]}]}}, 1),
+    ],
+)
+def test_courses_of_records_that_lack_something(record, expected):
+    assert drawing.courses(record) == expected
+    assert drawing.has_iterations(record) == bool(expected)
+
+
+@pytest.mark.parametrize(
+    ("low", "period", "labels"),
+    [
+        (0.0, 360.0, ["0°", "90°", "180°", "270°", "upper\nright", "upper\nleft", "lower\nleft", "lower\nright"]),
+        (-12.0, 24.0, ["0", "6", "-12", "-6"]),
+        (0.0, 2 * np.pi, ["0 rad", "1.57 rad", "3.14 rad", "4.71 rad"]),
+    ],
+)
+def test_the_wheel(tmp_path, low, period, labels):
+    figure = Figure(figsize=(2, 3))
+    scale = Scale(low, low + period, period=True)
+    drawing.key(figure, scale)
+    (axes,) = figure.axes
+    assert [text.get_text() for text in axes.texts] == labels
+    picture = axes.get_images()[0].get_array()
+    for value, place in ((0, (200, 340)), (period / 4, (340, 200)), (period / 2, (200, 60)), (-period / 4, (60, 200))):
+        assert np.allclose(picture[place][:3], scale.rgba(np.array([value]))[0, :3], atol=0.03)
+
+
+def test_the_key_says_what_grey_and_outlines_mean():
+    figure = Figure(figsize=(2, 4))
+    drawing.key(figure, Scale(0, 1), label="map", missing=True, filled=True)
+    bar, *swatches = figure.axes
+    assert bar.get_title() == "map"
+    assert [axes.texts[0].get_text() for axes in swatches] == ["no data", "filled in: no data\nbefore the run"]
+    assert swatches[0].get_facecolor()[:3] == MISSING
+
+
+# The sheet
+
+PLANE, SPACE = Grid.from_spacing((16, 16)), Grid.from_spacing((12, 12, 12))
+KINDS = {
+    "surface": lambda: run_on(box(), SPACE),
+    "angles on a cortex, at vertices": lambda: run_on(replace(box(), structure="CortexLeft"), period=10.0),
+    "curve": lambda: run_on(loop(), PLANE),
+    "flat": lambda: run_on(None, SPACE),
+    "flat plane": lambda: run_on(None, PLANE),
+    "one map": lambda: replace(run_on(box(), SPACE, is_run=False, record=None), maps=run_on(box(), SPACE).maps[:1]),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_sheet_of_every_kind(kind, tmp_path):
+    report.write(tmp_path / "sheet.PNG", KINDS[kind]())
+    pixels = imread(tmp_path / "sheet.PNG")
+    assert pixels.shape[1] == 1800
+    assert 600 < pixels.shape[0] < 3200
+    assert 0.05 < (pixels[..., :3].min(-1) < 0.9).mean() < 0.8
+
+
+@pytest.mark.parametrize(
+    "record", [None, {}, {"Noise": {"sd": [None], "after": [1.0]}, "Smoothness": {}, "Iterations": 0}]
+)
+def test_a_sheet_of_a_record_that_lacks_something(record, tmp_path):
+    sheet.draw(tmp_path / "sheet.png", run_on(loop(), PLANE, record=record))
+    assert (tmp_path / "sheet.png").stat().st_size > 10_000
+
+
+def test_a_sheet_without_any_value(tmp_path):
+    mesh = box()
+    nothing = Map("nothing", np.full(len(mesh.vertices_ras_mm), np.nan))
+    sheet.draw(tmp_path / "sheet.png", Subject("s", (nothing, nothing), mesh, is_run=True))
+    assert share(imread(tmp_path / "sheet.png")[..., :3], MISSING) > 0.01
+
+
+def test_the_words_of_a_run(tmp_path, monkeypatch):
+    text = words(run_on(replace(box(), structure="CortexLeft"), SPACE, notes=("a note",)), tmp_path, monkeypatch)
+    assert "noise 2 → 0.5   ·   removed 1.5 rms   ·   smoothness 1.0 → 4.0 mm FWHM" in text
+    assert "2 iterations (stop: iterations)   ·   3.0 s" in text
+    assert "Warning: the first\nWarning: the second" in text
+    for expected in (
+        "a note",
+        "lateral, inflated",
+        "medial, inflated",
+        "dorsal, inflated",
+        "posterior, inflated",
+        "-2:2",
+    ):
+        assert expected in text
+    assert "phi" not in text.split("\n")  # it was not used
+
+
+def test_the_first_channel_is_shown_and_that_is_said(tmp_path, monkeypatch):
+    one = run_on(box())
+    maps = tuple(replace(m, values=np.stack([m.values, 100 * m.values, m.values], 1)) for m in one.maps)
+    text = words(replace(one, maps=maps), tmp_path, monkeypatch)
+    assert "channel 1 of 3 is shown" in text
+    assert "removed (vertices): rms 2.5" in text  # not of the others
+
+
+def test_many_maps_are_a_figure_of_panels(tmp_path, monkeypatch):
+    mesh = box()
+    values = mesh.vertices_ras_mm[:, 0]
+    maps = tuple(Map(f"beta {k}", values + k) for k in range(5))
+    text = words(Subject("a figure", maps, mesh), tmp_path, monkeypatch)
+    assert [line for line in text.split("\n") if line.startswith("beta")] == [f"beta {k}" for k in range(5)]
+    assert "values" not in text and "lateral" not in text
+    sheet.draw(
+        tmp_path / "flat.png",
+        Subject("f", tuple(Map(str(k), None, np.ones(SPACE.shape)) for k in range(3)), None, SPACE),
+    )
+    sheet.draw(tmp_path / "curve.png", Subject("c", tuple(Map(str(k), np.ones(60)) for k in range(3)), loop()))
+
+
+def test_a_large_surface_is_simplified_and_that_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(sheet, "TRIANGLES", 500)
+    mesh = box(30)
+    text = words(run_on(mesh), tmp_path, monkeypatch)
+    assert f"drawn with 500 of {len(mesh.cells):,} triangles" in text
+
+
+def test_small_data_are_shown_from_close_by(tmp_path, monkeypatch):
+    mesh = box(30)
+    values = np.where(mesh.vertices_ras_mm @ [1.0, 1, 0] > 40, 1.0, np.nan)
+    text = words(Subject("s", (Map("a", values),), mesh), tmp_path, monkeypatch)
+    assert "facing the data, close by" in text
+    assert "close by" not in words(run_on(mesh), tmp_path, monkeypatch)
+
+
+def test_a_sheet_that_cannot_be_written(tmp_path):
+    with pytest.raises(DataError, match=r"sheet\.png"):
+        sheet.draw(tmp_path / "none" / "sheet.png", run_on(loop(), PLANE))
+
+
+def test_what_is_missing_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "find_spec", lambda name: None if name == "colorcet" else name)
+    with pytest.raises(RefusedError, match=r"colorcet.*pip install 'beltrami_cli\[report\]'"):
+        report.write(tmp_path / "a.png", run_on(loop(), PLANE))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_no_global_state_of_matplotlib_is_touched(tmp_path):
     script = (
-        "import sys, numpy as np; from pathlib import Path; from beltrami_cli.report.drawing import draw_before_after;"
-        "from beltrami_cli.surface import Mesh; assert 'matplotlib' not in sys.modules;"
-        "draw_before_after(Path(sys.argv[1]), Mesh(np.eye(3), np.array([[0, 1, 2]])), np.arange(3.), np.arange(3.));"
-        "assert 'matplotlib.pyplot' not in sys.modules"
+        "import sys, numpy as np; from pathlib import Path; from beltrami_cli.report import sheet;"
+        "from beltrami_cli.report.subject import Map, Subject; from beltrami_cli.surface import Mesh;"
+        "assert 'matplotlib' not in sys.modules; import matplotlib; was = matplotlib.rcParams.copy();"
+        "one = Map('a', np.arange(3.));"
+        "sheet.draw(Path(sys.argv[1]), Subject('s', (one,), Mesh(np.eye(3), np.array([[0, 1, 2]]))));"
+        "assert 'matplotlib.pyplot' not in sys.modules and matplotlib.rcParams.copy() == was"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", script, tmp_path / "a.png"], check=True)
+
+
+def test_shades_of_lines_stay_apart():
+    assert len({to_rgb(colour) for colour in drawing.LINES}) == len(drawing.LINES) >= 6

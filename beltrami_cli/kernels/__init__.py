@@ -6,6 +6,8 @@ from pathlib import Path
 import numba as nb
 import numpy as np
 
+from beltrami_cli.errors import RefusedError
+
 # How often GNU's OpenMP, where numba uses it, looks for the next loop before its threads sleep: about 10 microseconds.
 # Its own 300,000 make a small run take up to 100 times as long where other programs want the CPUs too; with this an
 # idle machine is as fast as before. Read when the first parallel kernel runs.
@@ -19,13 +21,20 @@ BLOCK = 2048
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
 
 
-@nb.njit(cache=True)
-def total(parts):
-    """The sum in order of place: numba's own, inside a parallel function, depends on the number of threads."""
-    s = 0.0
-    for part in parts:
-        s += part
-    return s
+try:
+
+    @nb.njit(cache=True)
+    def total(parts):
+        """The sum in order of place: numba's own, inside a parallel function, depends on the number of threads."""
+        s = 0.0
+        for part in parts:
+            s += part
+        return s
+
+except RuntimeError as error:  # of the first kernel that numba meets
+    raise RefusedError(
+        f"compiled kernels can be kept nowhere ({error}); set NUMBA_CACHE_DIR to a folder that can be written to"
+    ) from error
 
 
 def wake() -> None:

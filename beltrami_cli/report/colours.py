@@ -1,0 +1,91 @@
+"""Colours that are even to the eye, and that stay apart without full colour vision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beltrami_cli.report.subject import Map, Subject
+
+PERCENTILES = (2.0, 98.0)  # a few outliers must not take the whole colour scale
+
+# Greys that no map contains: viridis comes near the middle ones for eyes without red or green cones. Without data,
+# sulci are a little darker than gyri.
+MISSING = (0.74, 0.74, 0.74)
+MISSING_SULCUS = (0.64, 0.64, 0.64)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Which value has which colour.
+
+    low, high: data units, the values of the map's ends; what lies beyond them has the end's colour. period: of angles,
+    which wrap round from high to low. differences: low = -high, and 0 is pale.
+    """
+
+    low: float
+    high: float
+    period: bool = False
+    differences: bool = False
+
+    @property
+    def name(self) -> str:
+        """The map's name in matplotlib, or in colorcet where it begins with cet_."""
+        if self.period:
+            return "cet_CET_CBC1"
+        return "cet_CET_CBD1" if self.differences else "viridis"
+
+    def table(self) -> np.ndarray:
+        """(256, 3) uint8 colours from low to high. An angle has the same one whatever the range of angles."""
+        import colorcet
+        from matplotlib import colormaps
+        from matplotlib.colors import ListedColormap
+
+        found = colormaps["viridis"] if self.name == "viridis" else ListedColormap(getattr(colorcet, self.name[4:]))
+        colours = np.asarray(found(np.arange(256), bytes=True)[:, :3])
+        return np.roll(colours, -round(256 * self.low / (self.high - self.low)), axis=0) if self.period else colours
+
+    def rgba(self, values: np.ndarray) -> np.ndarray:
+        """(N, 4) colours of values (N,), from 0 to 1; MISSING where they are not finite."""
+        values = np.asarray(values, float)
+        known = np.isfinite(values)
+        share = (np.where(known, values, self.low) - self.low) / (self.high - self.low)
+        steps = np.floor((share % 1 if self.period else np.clip(share, 0, 1)) * 256)
+        colours = np.ones((len(values), 4))
+        colours[:, :3] = np.where(
+            known[:, None], self.table()[np.minimum(steps, 255).astype(int)] / 255, np.array(MISSING)
+        )
+        return colours
+
+
+def values_of(shown: Map) -> np.ndarray:
+    """(N,) the values of a map of one channel at the vertices or, where it has none there, of all voxels."""
+    values = shown.volume if shown.values is None else shown.values
+    assert values is not None
+    return np.ravel(values)
+
+
+def scale_of(subject: Subject) -> Scale:
+    """One scale for all maps of a subject with one channel.
+
+    Angles: the whole period. Else 2nd to 98th percentile of the last map where the first is known, so that neither
+    noise nor what was filled in flattens the result; else of all of the last, else of the first, else (0, 1).
+    """
+    if subject.period is not None:
+        return Scale(subject.low, subject.low + subject.period, period=True)
+    first, last = values_of(subject.maps[0]), values_of(subject.maps[-1])
+    for values in (last[np.isfinite(first)], last, first):
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            low, high = np.percentile(finite, PERCENTILES)
+            if high > low:
+                return Scale(float(low), float(high))
+    return Scale(0.0, 1.0)
+
+
+def removed_scale(subject: Subject) -> Scale:
+    """The scale of what a run removed, even about 0, to the 98th percentile of its size."""
+    removed = np.abs(subject.removed())
+    most = float(np.percentile(removed, PERCENTILES[1])) if removed.size else 0.0
+    return Scale(-most, most, differences=True) if most > 0 else Scale(-1.0, 1.0, differences=True)

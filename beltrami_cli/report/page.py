@@ -1,0 +1,360 @@
+"""A page that shows a subject in any browser: one file that opens offline.
+
+Markup, behaviour and looks are in page.html, page.js and page.css; what they show is put together here.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beltrami_cli.formats import checks
+from beltrami_cli.report import colours, drawing, geometry
+from beltrami_cli.report.colours import Scale
+from beltrami_cli.report.subject import Subject
+from beltrami_cli.surface import Mesh
+
+# A browser turns this many fluently without a graphics card; a hemisphere of 327,680 still shows every gyrus.
+TRIANGLES = 120_000
+# Browsers keep 16 WebGL scenes at most; 4 maps, folded and inflated, need 8.
+MAPS = 4
+# Each channel has its own slices and histograms, about a second and 0.5 MB.
+CHANNELS = 6
+# Bytes of the page that values at vertices may take, beside plotly.js (5 MB) and the pictures.
+VALUE_BYTES = 5_000_000
+# Outlines stand off the surface by this share of its length, or the surface would hide half of them.
+STAND_OFF = 0.004
+# Drawings are as wide as the text, 1,150 pixels at most: of so many inches, letters of 8 points are 18 pixels high
+# there, and 12 in a window of 800.
+INCHES = 7.0
+RASTER_DPI = 200
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A drawing of the page: its address (data:), what it shows in words, and of which channel (None: of all)."""
+
+    heading: str
+    source: str
+    alt: str
+    channel: int | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text. heading: what it is of. columns: none for pairs of a name and a value."""
+
+    heading: str
+    rows: Sequence[Sequence[str]]
+    columns: Sequence[str] = ()
+
+
+def write(path: Path, subject: Subject) -> None:
+    """Write a page (HTML) that shows a subject, whatever the path's suffix.
+
+    It needs no network. A surface turns in 3-D, each map beside the next (the first `MAPS`), with at most `TRIANGLES`
+    triangles; a curve and flat data are drawn. Of many channels the first are shown, `CHANNELS` at most.
+
+    Raises DataError where the file cannot be written.
+    """
+    with checks.writing(path):
+        path.write_text(page(subject), encoding="utf-8", errors="backslashreplace")
+
+
+def page(subject: Subject) -> str:
+    """The page as text."""
+    record = subject.record or {}
+    has_scene = subject.mesh is not None and not subject.is_curve and len(subject.mesh.cells) > 0
+    channels = _channels_shown(subject)
+    scene, notes = _scene(subject, channels) if has_scene else (None, [])
+    if channels < subject.channels:
+        notes.append(f"Shown: the first {channels} of {subject.channels:,} channels.")
+    return fill(
+        "page.html",
+        title=subject.title,
+        facts=facts(record),
+        warnings=[str(line) for line in record.get("Warnings") or ()],
+        notes=[*subject.notes, *notes],
+        channels=channels,
+        scene=scene,
+        plotly=_plotly() if has_scene else None,
+        pictures=list(_pictures(subject, channels)),
+        tables=list(tables(record)),
+        version=_version(record),
+    )
+
+
+def fill(template: str, **values: Any) -> str:
+    """A template of this folder with values in their places, everything escaped."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    folder = Path(__file__).parent
+    environment = Environment(
+        loader=FileSystemLoader(folder),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["own"] = lambda name: Markup((folder / name).read_text(encoding="utf-8"))
+    return environment.get_template(template).render(**values)
+
+
+def _plotly() -> Any:
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs
+
+    return Markup(get_plotlyjs())
+
+
+def _channels_shown(subject: Subject) -> int:
+    vertices = 0 if subject.mesh is None else min(len(subject.mesh.vertices_ras_mm), TRIANGLES // 2)
+    bytes_each = max(1, vertices * 4 * 4 // 3 * len(subject.maps[:MAPS]))
+    return min(subject.channels, CHANNELS, max(1, VALUE_BYTES // bytes_each))
+
+
+# The surface in 3-D
+
+
+def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
+    """What page.js draws, JSON-ready, and what a reader has to know about it."""
+    whole = subject.mesh
+    assert whole is not None
+    mesh, source, notes = whole, np.arange(len(whole.vertices_ras_mm)), []
+    if len(whole.cells) > TRIANGLES:
+        mesh, source = geometry.simplified(whole, TRIANGLES)
+        notes.append(
+            f"3-D: shown with {len(mesh.cells):,} of {len(whole.cells):,} triangles; "
+            "values as at the nearest original vertex."
+        )
+    maps = subject.maps[:MAPS]
+    if len(maps) < len(subject.maps):
+        notes.append(f"3-D: the first {len(maps)} of {len(subject.maps)} maps.")
+    filled = np.zeros(len(source), bool)
+    for shown in maps:
+        if shown.filled is not None:
+            filled |= shown.filled[source]
+    is_cortex = geometry.is_cortex(whole)
+    forms = {"folded" if is_cortex else "surface": mesh}
+    if is_cortex:
+        forms["inflated"] = geometry.inflated(mesh)
+    scales = [colours.scale_of(subject.channel(k)) for k in range(channels)]
+    first = np.isfinite(_of_channel(maps[0].values, 0))
+    scene = {
+        "triangles": _packed(mesh.cells, np.uint32),
+        "forms": [_form(name, form, filled) for name, form in forms.items()],
+        "sulcus": _packed(geometry.curvature(mesh) < 0, np.uint8) if is_cortex else None,
+        "maps": [
+            {
+                "title": shown.title,
+                "values": [_packed(_of_channel(shown.values, k)[source], np.float32) for k in range(channels)],
+                "filled": None if shown.filled is None else _packed(shown.filled[source], np.uint8),
+            }
+            for shown in maps
+        ],
+        "scales": [{"low": scale.low, "high": scale.high, "cyclic": scale.period} for scale in scales],
+        "colours": _packed(scales[0].table(), np.uint8),
+        "greys": [colours.MISSING, colours.MISSING_SULCUS],
+        "views": [{"name": view.name, "camera": view.camera.tolist()} for view in geometry.views(whole)],
+        "best": geometry.best_view(whole, first).camera.tolist(),
+    }
+    return scene, notes
+
+
+def _of_channel(values: np.ndarray | None, k: int) -> np.ndarray:
+    assert values is not None
+    return values[:, k] if values.ndim == 2 else values
+
+
+def _form(name: str, mesh: Mesh, filled: np.ndarray) -> dict[str, Any]:
+    """A surface in a box whose longest edge is 1: positions in steps of 1/65535, and outlines of filled places."""
+    points = mesh.vertices_ras_mm
+    low, high = points.min(0), points.max(0)
+    longest = float((high - low).max()) or 1.0
+    borders = geometry.filled_border(mesh, filled) if filled.any() else np.zeros((0, 2, 3))
+    middle = (low + high) / 2
+    return {
+        "name": name,
+        "positions": _packed(np.rint((points - low) / longest * 65535), np.uint16),
+        "half": ((high - low) / longest / 2).tolist(),
+        "borders": _packed((_lifted(borders, mesh, STAND_OFF * longest) - middle) / longest, np.float32),
+    }
+
+
+def _lifted(segments: np.ndarray, mesh: Mesh, height: float) -> np.ndarray:
+    """Segments (S, 2, 3) moved off the surface, along the normal of the nearest vertex."""
+    from scipy.spatial import cKDTree
+
+    if not len(segments):
+        return segments
+    a, b, c = (mesh.vertices_ras_mm[mesh.cells[:, k]] for k in range(3))
+    normals = np.zeros_like(mesh.vertices_ras_mm)
+    for k in range(3):
+        np.add.at(normals, mesh.cells[:, k], np.cross(b - a, c - a))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    _, nearest = cKDTree(mesh.vertices_ras_mm).query(segments.reshape(-1, 3))
+    return segments + height * normals[nearest].reshape(segments.shape)
+
+
+def _packed(array: np.ndarray, kind: type[np.generic]) -> str:
+    """An array's bytes, little-endian, in base64: what a typed array of JavaScript takes."""
+    values = np.ascontiguousarray(array, np.dtype(kind).newbyteorder("<"))
+    return base64.b64encode(values.tobytes()).decode("ascii")
+
+
+# Drawings
+
+
+def _pictures(subject: Subject, channels: int) -> Iterator[Picture]:
+    titles = ", ".join(shown.title for shown in subject.maps)
+    for k in range(channels):
+        one = subject.channel(k)
+        of = k if channels > 1 else None
+        scale = colours.scale_of(one)
+        if subject.is_curve:
+            alt = f"Values along the curve over the arc length: {titles}."
+            yield Picture("Along the curve", _drawn(drawing.curve, 3.0, one), alt, of)
+        if one.maps[0].volume is not None:
+            alt = f"Slices through the volumes with the surface's outline: {titles}."
+            is_plane = subject.grid is not None and 1 in subject.grid.shape
+            rows = 1 if is_plane else len(subject.maps) + subject.is_run
+            yield Picture("Slices", _drawn(_slices, 1.75 * rows + 0.4, one, scale), alt, of)
+        what = f"How often each value occurs: {titles}" + ("; and what was removed." if subject.is_run else ".")
+        yield Picture("Histograms", _drawn(drawing.histograms, 2.2, one), what, of)
+    if drawing.has_iterations(subject.record):
+        alt = "Over the iterations: change, and where known noise, beta and held-out error."
+        width = max(INCHES, 2.1 * drawing.courses(subject.record))
+        drawn = _drawn(drawing.iterations, 2.2, subject.record, subject.period, width=width)
+        yield Picture("Over the iterations", drawn, alt)
+
+
+def _slices(figure: Any, subject: Subject, scale: Scale) -> None:
+    """Slices, and beside them what their colours mean."""
+    left, right = figure.subfigures(1, 2, width_ratios=[INCHES - 1.4, 1.4])
+    drawing.slices(left, subject, scale)
+    drawing.key(right, scale)
+
+
+def _drawn(draw: Callable[..., None], height: float, *what: Any, width: float = INCHES) -> str:
+    """A drawing as the address of an SVG; width and height in inches."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    # A fixed salt and no date: the same subject makes the same bytes.
+    with rc_context({**drawing.STYLE, "svg.fonttype": "path", "svg.hashsalt": "beltrami"}):
+        figure = Figure(figsize=(width, height), facecolor="white")
+        draw(figure, *what)
+        file = io.BytesIO()
+        figure.savefig(file, format="svg", dpi=RASTER_DPI, metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(file.getvalue()).decode("ascii")
+
+
+# The record in words
+
+
+def facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a run did, in pairs of a name and a value; what the record lacks is left out."""
+    noise, removed, smoothness, used = (
+        record.get(key) or {} for key in ("Noise", "Removed", "Smoothness", "Parameters")
+    )
+    flow = " ".join(str(used[key]) for key in ("flow", "phi") if used.get(key) is not None)
+    beta = used.get("beta")
+    found = {
+        "Noise": _change(_together(noise.get("sd")), _together(noise.get("after"))),
+        "Removed (rms)": _figure(removed.get("rms")),
+        "Smoothness (FWHM)": _change(smoothness.get("before_mm"), smoothness.get("after_mm"), " mm"),
+        "Iterations": _figure(record.get("Iterations")),
+        "Stopped by": str(record.get("StopReason") or ""),
+        "Flow": flow + (f", beta {_figure(beta)}" if beta is not None else ""),
+    }
+    return [(name, value) for name, value in found.items() if value]
+
+
+def _change(before: float | None, after: float | None, unit: str = "") -> str:
+    if before is None and after is None:
+        return ""
+    return f"{_figure(before) or '?'} → {_figure(after) or '?'}{unit}"
+
+
+def _together(per_channel: Sequence[float | None] | None) -> float | None:
+    """The root of the mean square of the known ones."""
+    known = [sd for sd in per_channel or () if sd is not None]
+    return math.sqrt(sum(sd * sd for sd in known) / len(known)) if known else None
+
+
+def _figure(value: Any) -> str:
+    """A number to three digits, whole ones in full; other things as they are."""
+    if value is None:
+        return ""
+    return f"{value:.3g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)
+
+
+# Shown elsewhere on the page, or drawn.
+_APART = ("Parameters", "Sources", "Outputs", "Warnings", "Seconds", "Choice", "PerIteration", "GeneratedBy", "Request")
+
+
+def tables(record: Mapping[str, Any]) -> Iterator[Table]:
+    """Everything that the record says, but what goes on for as long as the iterations."""
+    if record.get("Parameters"):
+        yield Table("Parameters", list(_flat(record["Parameters"])))
+    choice = record.get("Choice") or {}
+    if choice.get("table"):
+        columns = list(dict.fromkeys(key for row in choice["table"] for key in row))
+        rows = [[_text(row.get(key)) for key in columns] for row in choice["table"]]
+        yield Table("Automatic choice: what was tried", rows, [_spelt(key) for key in columns])
+    chosen = {key: value for key, value in choice.items() if key not in ("table", "errors")}
+    if chosen:
+        yield Table("Automatic choice", list(_flat(chosen)))
+    if record.get("Sources"):
+        rows = [[_text(source.get(key)) for key in ("Role", "Path", "SHA256")] for source in record["Sources"]]
+        yield Table("Sources", rows, ["Role", "Path", "SHA-256"])
+    if record.get("Outputs"):
+        yield Table("Outputs", [[_text(file)] for file in record["Outputs"]], ["Path"])
+    if record.get("Seconds"):
+        yield Table("Seconds", list(_flat(record["Seconds"])))
+    rest = {key: value for key, value in record.items() if key not in _APART}
+    if rest:
+        yield Table("Further figures", list(_flat(rest)))
+
+
+def _flat(record: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """Pairs of a name and a value, those of records within it too."""
+    for key, value in record.items():
+        name = f"{above}: {_spelt(key)}" if above else _spelt(key)
+        if isinstance(value, Mapping):
+            yield from _flat(value, name)
+        else:
+            yield name, _text(value)
+
+
+def _spelt(key: object) -> str:
+    return str(key).replace("_", " ")
+
+
+def _text(value: Any) -> str:
+    """A value as a reader expects it, numbers to six digits."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(f"({_text(each)})" if isinstance(each, (list, tuple)) else _text(each) for each in value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{_spelt(key)} {_text(each)}" for key, each in value.items())
+    return str(value)
+
+
+def _version(record: Mapping[str, Any]) -> str:
+    """Which programs made it, and when, as the record says."""
+    by = [f"{each.get('Name', '?')} {each.get('Version', '')}".strip() for each in record.get("GeneratedBy") or ()]
+    return ", ".join([*by, *([str(record["Created"])] if record.get("Created") else [])])
