@@ -229,7 +229,8 @@ def _subject(job: Job, scene: Scene, mesh: Mesh | None, maps: tuple[Map, ...], r
         grid=None if maps[0].volume is None else Canonical(scene.grid).grid,
         period=job.settings.period,
         low=0.0 if wrapped is None else wrapped[0],
-        is_run=True,
+        compares=True,
+        difference="removed",
         record=record,
         notes=tuple(notes),
     )

@@ -15,6 +15,8 @@ from beltrami_cli.grid import Canonical, Volume, require_same_grid
 from beltrami_cli.inputs import Warnings, without
 from beltrami_cli.pipeline import map_of, parts, read_data, read_levelset, solver_on
 from beltrami_cli.progress import Phases
+from beltrami_cli.report.colours import require_map
+from beltrami_cli.report.geometry import SIDES
 from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.surface import Mesh
 from beltrami_cli.survey import REMEDY, Scene, survey
@@ -30,7 +32,8 @@ class View:
     files: volumes on one grid, values at the vertices of `levelset`, which then is a mesh, or, without `levelset`,
     meshes that hold values on the same triangles; volumes without `levelset` are shown as slices alone. titles: of the
     maps, in their order; none for the names of the files. compare: there are two maps, and their difference is shown.
-    period: of angles. Everything else as in `config.Job` and `config.Settings`.
+    period: of angles. side: from where the surface is seen, a name in `report.geometry.SIDES`. colours: the name of a
+    colour map. Everything else as in `config.Job` and `config.Settings`.
 
     Raises RefusedError where the numbers of files and titles do not fit.
     """
@@ -40,6 +43,8 @@ class View:
     levelset: Path | None = None
     titles: tuple[str, ...] = ()
     compare: bool = False
+    side: str | None = None
+    colours: str | None = None
     period: float | None = None
     missing: float | None = None
     inside: str = "negative"
@@ -58,6 +63,8 @@ class View:
             raise RefusedError(f"compare: found {len(self.files)} files; expected two: --compare A B")
         if self.titles and len(self.titles) != len(self.files):
             raise RefusedError(f"titles: found {len(self.titles)}; expected {len(self.files)}, one for each file")
+        if self.side not in (None, *SIDES):
+            raise RefusedError(f"side: found {self.side!r}; expected one of {', '.join(SIDES)}")
         if self.period is not None:
             object.__setattr__(self, "period", parse_period(self.period))
 
@@ -79,13 +86,15 @@ def look(view: View, *, notify: Callable[[str], None] | None = None) -> Subject:
     exists or is neither .html nor .png.
     """
     report.require(view.output)
+    if view.colours is not None:
+        require_map(view.colours)
     inputs = [*view.files, *([view.levelset] if view.levelset else [])]
     for path in inputs:
         formats.require_file(path)
     with formats.Stage([view.output], overwrite=view.overwrite, inputs=inputs) as stage:
         warnings = Warnings(notify)
         subject = _meshes(view) if _are_meshes(view) else _maps(view, warnings)
-        report.write(stage.path(view.output), replace(subject, is_run=view.compare))
+        report.write(stage.path(view.output), subject)
         stage.commit()
     return subject
 
@@ -196,5 +205,14 @@ def _subject(view: View, maps: Sequence[Map], mesh: Mesh | None) -> Subject:
     if view.period is not None:
         values = [m.volume if m.values is None else m.values for m in maps]
         low = -view.period / 2 if any(np.nanmin(v, initial=0.0) < 0 for v in values if v is not None) else 0.0
-    title = " and ".join(view.names) if len(maps) < 3 else f"{len(maps)} maps"
-    return Subject(title, tuple(maps), mesh, None, view.period, low, view.compare)
+    return Subject(
+        title=" and ".join(view.names) if len(maps) < 3 else "",
+        maps=tuple(maps),
+        mesh=mesh,
+        period=view.period,
+        low=low,
+        compares=view.compare,
+        difference=" − ".join(view.names) if view.compare else "",
+        side=view.side,
+        colours=view.colours,
+    )

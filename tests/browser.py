@@ -35,7 +35,15 @@ def angles(mesh: Mesh, title: str = "angles", noise: float = 40.0, **changes: An
     before[cap | (z < 0.8 * z.min())] = np.nan
     after = np.where(z < 0.8 * z.min(), np.nan, clean)
     maps = (Map("before", before), Map("after", after, None, cap & np.isfinite(after)))
-    subject = {"title": title, "maps": maps, "mesh": mesh, "period": 360.0, "is_run": True, "record": RECORD}
+    subject = {
+        "title": title,
+        "maps": maps,
+        "mesh": mesh,
+        "period": 360.0,
+        "compares": True,
+        "difference": "removed",
+        "record": RECORD,
+    }
     return Subject(**{**subject, **changes})
 
 

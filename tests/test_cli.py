@@ -6,6 +6,7 @@ import fcntl
 import gzip
 import os
 import pty
+import re
 import signal
 import struct
 import subprocess
@@ -27,8 +28,8 @@ OPTIONS = {
     "--extend-every --band --spacing --resample --inside --outside --precision --config --threads --flat --overwrite "
     "--on --labels --between --map --frame --structure --memory --report",
     "batch": "--jobs --scheduler --resume --dry-run --summary --report --part --threads --memory --retries --overwrite",
-    "view": "-o --levelset --compare --titles --period --missing --map --labels --between --inside --spacing --resample "
-    "--frame --overwrite",
+    "view": "-o --levelset --compare --titles --side --colours --period --missing --map --labels --between --inside "
+    "--spacing --resample --frame --overwrite",
     "levelset": "-o --labels --between --like --spacing --margin --frame --overwrite",
     "sample": "-o --kind --period --missing --frame --structure --spacing --overwrite",
     "mesh": "-o --spacing --resample --inside --overwrite",
@@ -56,7 +57,7 @@ def process(*arguments: object, **options: object) -> subprocess.CompletedProces
 @pytest.mark.parametrize("command", OPTIONS)
 def test_help_names_every_option(command):
     run = done(command, "--help")
-    words = set(run.out.replace(",", " ").replace("[", " ").replace("]", " ").replace("|", " ").split())
+    words = set(re.sub(r"[],|{}[]", " ", run.out).split())
     words |= {word.rstrip(".):;") for word in words}
     expected = {*OPTIONS[command].split(), *CHOICES.get(command, "").split(), "-q", "--quiet", "-v", "--verbose"}
     assert expected - words == set()

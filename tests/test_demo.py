@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from command import beltrami, contents, done, load, record, refused
 
+from beltrami_cli import report
+
 FILES = {"denoised.nii.gz", "denoised.ply", "denoised.json"}
 
 
@@ -21,11 +23,7 @@ def phantom(tmp_path: Path) -> Path:
 @pytest.fixture
 def no_matplotlib(monkeypatch):
     real = importlib.util.find_spec
-
-    def find(name: str, *rest: object) -> object:
-        return None if name == "matplotlib" else real(name, *rest)
-
-    monkeypatch.setattr("beltrami_cli.demo.find_spec", find)
+    monkeypatch.setattr(report, "find_spec", lambda name: None if name == "matplotlib" else real(name))
 
 
 def decibels(line: str) -> tuple[float, float]:

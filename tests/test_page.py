@@ -63,14 +63,16 @@ def circle() -> Subject:
     values = np.sin(turn)
     volume = np.random.default_rng(0).random((17, 17, 1))
     maps = (Map("before", values + 0.1, volume), Map("after", values, volume / 2))
-    return Subject("circle", maps, mesh, Grid.from_spacing((17, 17, 1)), is_run=True, record=RECORD)
+    return Subject(
+        "circle", maps, mesh, Grid.from_spacing((17, 17, 1)), compares=True, difference="removed", record=RECORD
+    )
 
 
 def flat() -> Subject:
     volume = np.random.default_rng(0).random((12, 13, 14))
     return Subject(
         "flat", (Map("before", None, volume), Map("after", None, volume / 2)), None, Grid.from_spacing((12, 13, 14)),
-        is_run=True, record=RECORD,
+        compares=True, difference="removed", record=RECORD,
     )  # fmt: skip
 
 
@@ -86,8 +88,8 @@ SUBJECTS = {
     "circle": circle,
     "flat": flat,
     "channels": three_channels,
-    "volume alone": lambda: replace(flat(), maps=flat().maps[:1], is_run=False, record=None),
-    "compared": lambda: replace(angles(sphere(2)), maps=angles(sphere(2)).maps * 3, is_run=False, record=None),
+    "volume alone": lambda: replace(flat(), maps=flat().maps[:1], compares=False, record=None),
+    "compared": lambda: replace(angles(sphere(2)), maps=angles(sphere(2)).maps * 3, compares=False, record=None),
 }
 
 

@@ -16,10 +16,10 @@ from matplotlib.image import imread
 from beltrami_cli import report
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.grid import Grid
-from beltrami_cli.report import drawing, sheet
-from beltrami_cli.report.colours import MISSING, Scale
-from beltrami_cli.report.drawing import DENOISED, INPUT, TRUTH
+from beltrami_cli.report import graphs, key, sheet, slices, style, surfaces
+from beltrami_cli.report.colours import FILLED, MISSING, Scale
 from beltrami_cli.report.geometry import View
+from beltrami_cli.report.style import DENOISED, INPUT, TRUTH
 from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.surface import Mesh
 
@@ -76,7 +76,9 @@ def run_on(mesh: Mesh | None, grid: Grid | None = None, **changes: object) -> Su
     filled = None if values is None else np.arange(len(values)) < len(values) / 5
     before = Map("before", None if values is None else np.where(filled, np.nan, values), volume)
     after = Map("after", None if values is None else values / 2, None if volume is None else volume / 2, filled)
-    return replace(Subject("a run", (before, after), mesh, grid, is_run=True, record=RECORD), **changes)
+    return replace(
+        Subject("a run", (before, after), mesh, grid, compares=True, difference="removed", record=RECORD), **changes
+    )
 
 
 def saved(tmp_path, figure: Figure) -> np.ndarray:
@@ -115,7 +117,7 @@ def test_the_nearer_surface_hides_the_farther(tmp_path, order):
     mesh = replace(mesh, cells=mesh.cells[::order])
     figure = Figure(figsize=(2, 2))
     colours = Scale(0, 1).rgba(np.repeat([0.0, 1.0], 4))
-    drawing.surface(figure.add_axes((0, 0, 1, 1)), mesh, colours, ABOVE)
+    surfaces.draw(figure.add_axes((0, 0, 1, 1)), mesh, colours, ABOVE)
     pixels = saved(tmp_path, figure)
     assert share(pixels, VIRIDIS(1.0)) > 0.9
     assert share(pixels, VIRIDIS(0.0)) == 0
@@ -124,10 +126,10 @@ def test_the_nearer_surface_hides_the_farther(tmp_path, order):
 def test_sides_turn_darker_and_a_box_shows_a_part(tmp_path):
     mesh = squares(0.0)
     slanted = View("slanted", np.array([[1.0, 0, 0], [0, 0.5, 0.75**0.5], [0, -(0.75**0.5), 0.5]]))
-    for view, light in ((ABOVE, 1.0), (slanted, drawing.AMBIENT + (1 - drawing.AMBIENT) / 2)):
+    for view, light in ((ABOVE, 1.0), (slanted, surfaces.AMBIENT + (1 - surfaces.AMBIENT) / 2)):
         figure = Figure(figsize=(2, 2))
         colours = np.full((4, 4), [1.0, 0, 0, 1])
-        drawing.surface(figure.add_axes((0, 0, 1, 1)), mesh, colours, view, box=np.array([[0.0, 0], [0.4, 0.4]]))
+        surfaces.draw(figure.add_axes((0, 0, 1, 1)), mesh, colours, view, box=np.array([[0.0, 0], [0.4, 0.4]]))
         assert share(saved(tmp_path, figure), (light, 0, 0)) > 0.9
 
 
@@ -141,9 +143,9 @@ def test_filled_places_are_outlined(tmp_path):
     colours = np.full((n * n, 4), [1.0, 0, 0, 1])
     figure = Figure(figsize=(4, 4))
     axes = figure.add_axes((0, 0, 1, 1))
-    drawing.surface(axes, mesh, colours, ABOVE, filled)
+    surfaces.draw(axes, mesh, colours, ABOVE, filled)
     pixels = saved(tmp_path, figure)
-    rows, columns = np.nonzero(pixels.max(-1) < 0.2)  # black
+    rows, columns = np.nonzero(np.abs(pixels - to_rgb(FILLED)).max(-1) < 0.1)
     # 15.5 of 40 mm of 400 pixels.
     assert np.ptp(rows) == pytest.approx(155, abs=8) and np.ptp(columns) == pytest.approx(155, abs=8)
     assert share(pixels[190:210, 190:210], (1, 0, 0)) == 1
@@ -151,7 +153,7 @@ def test_filled_places_are_outlined(tmp_path):
 
 def test_the_letters_of_a_view():
     axes = Figure().add_subplot()
-    drawing.directions(axes, View("lateral", np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])))
+    surfaces.directions(axes, View("lateral", np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])))
     at = {text.get_text(): text.get_position() for text in axes.texts}
     assert at["A"][0] < 0 and at["P"][0] > 1  # anterior is on the left
     assert at["S"][1] > 1 and at["I"][1] < 0
@@ -164,7 +166,7 @@ def test_the_order_along_curves():
     # A loop 0-1-2-3 and an open part 4-5-6, segments in any order.
     vertices = np.concatenate([SQUARE, [[5.0, 0, 0], [5, 2, 0], [5, 2, 3]]])
     cells = np.array([[5, 6], [2, 3], [0, 1], [3, 0], [4, 5], [1, 2]], np.int32)
-    order, arc = drawing.along(Mesh(vertices, cells))
+    order, arc = graphs.along(Mesh(vertices, cells))
     assert order.tolist() == [4, 5, 6, -1, 0, 1, 2, 3, 0]
     assert arc.tolist() == [0, 2, 5, 5, 5, 6, 7, 8, 9]
 
@@ -173,7 +175,7 @@ def test_the_roughest_line_is_at_the_back():
     mesh = loop()
     rough, smooth = np.random.default_rng(0).normal(0, 1, 60), np.cos(np.arange(60) / 9)
     figure = Figure()
-    drawing.curve(
+    graphs.curve(
         figure, Subject("c", tuple(Map(*m) for m in (("true", smooth), ("noisy", rough), ("flat", 0 * rough))), mesh)
     )
     (axes,) = figure.axes
@@ -187,7 +189,7 @@ def test_a_curve_of_angles_is_not_joined_across_the_wrap():
     angles = (350 + np.arange(60)) % 360.0
     figure = Figure()
     one = Map("a", angles)
-    drawing.curve(figure, Subject("c", (one, one), loop(), period=360.0, is_run=True))
+    graphs.curve(figure, Subject("c", (one, one), loop(), period=360.0, compares=True, difference="removed"))
     for line in figure.axes[0].get_lines():
         drawn = np.asarray(line.get_ydata())
         assert np.nanmax(np.abs(np.diff(drawn))) < 180
@@ -204,7 +206,7 @@ def test_slices_show_values_where_they_are(tmp_path):
     volume[5, 10:, :] = 1.0
     figure = Figure(figsize=(9, 4))
     subject = Subject("s", (Map("a", None, volume),), None, grid)
-    drawing.slices(figure, subject, Scale(0, 1))
+    slices.draw(figure, subject, Scale(0, 1))
     sagittal, coronal, axial = figure.axes
     assert [axes.get_title() for axes in figure.axes] == [
         "sagittal, x = 10 mm",
@@ -220,18 +222,18 @@ def test_slices_show_values_where_they_are(tmp_path):
 def test_slices_of_a_run_show_what_was_removed(tmp_path):
     subject = run_on(box(), Grid.from_spacing((12, 12, 12)))
     figure = Figure(figsize=(8, 8))
-    drawing.slices(figure, subject)
+    slices.draw(figure, subject)
     names = [text.get_text() for axes in figure.axes for text in axes.texts]
     assert [name for name in names if len(name) > 1] == ["before", "after", "removed"]
     assert len(figure.axes[0].collections) == 2  # the outline and its casing
-    assert drawing.slices_height(subject, 8.0) > drawing.slices_height(replace(subject, is_run=False), 8.0)
+    assert slices.height(subject, 8.0) > slices.height(replace(subject, compares=False), 8.0)
 
 
 def test_slices_cut_where_the_data_are():
     mesh = box(30)
     grid = Grid.from_spacing((30, 30, 30))
     values = np.where(mesh.vertices_ras_mm[:, 0] > 20, 1.0, np.nan)
-    cuts = drawing.cuts_of(Subject("s", (Map("a", values, np.ones(grid.shape)),), mesh, grid))
+    cuts = slices.cuts_of(Subject("s", (Map("a", values, np.ones(grid.shape)),), mesh, grid))
     assert cuts.index[0] > 20 and abs(cuts.index[1] - 14.5) < 2
     assert (cuts.box[0] <= 2).all() and (cuts.box[1] >= 27).all()
 
@@ -240,7 +242,7 @@ def test_without_a_volume_the_outline_has_the_colours(tmp_path):
     mesh = box(30)
     subject = Subject("s", (Map("a", np.ones(len(mesh.vertices_ras_mm))),), mesh)
     figure = Figure(figsize=(9, 4))
-    drawing.slices(figure, subject, Scale(0, 1))
+    slices.draw(figure, subject, Scale(0, 1))
     assert share(saved(tmp_path, figure), VIRIDIS(1.0)) > 0.002
     assert share(saved(tmp_path, figure), MISSING) < 0.001
 
@@ -251,7 +253,7 @@ def test_without_a_volume_the_outline_has_the_colours(tmp_path):
 def test_histograms_count_what_both_maps_have():
     figure = Figure(figsize=(6, 2))
     before, after = Map("before", np.array([1.0, 2, np.nan, 4])), Map("after", np.array([1.0, 2, 3, 1]))
-    drawing.histograms(figure, Subject("s", (before, after), is_run=True))
+    graphs.histograms(figure, Subject("s", (before, after), compares=True, difference="removed"))
     values, removed = figure.axes
     assert values.get_title() == "values (3 vertices)"
     assert removed.get_title() == "removed (vertices): rms 1.73"
@@ -259,8 +261,8 @@ def test_histograms_count_what_both_maps_have():
 
 def test_courses_over_the_iterations():
     figure = Figure(figsize=(10, 2))
-    assert drawing.has_iterations(RECORD) and drawing.courses(RECORD) == 5
-    drawing.iterations(figure, RECORD)
+    assert graphs.has_iterations(RECORD) and graphs.courses(RECORD) == 5
+    graphs.iterations(figure, RECORD)
     at = {axes.get_title(): axes for axes in figure.axes}
     assert list(at) == ["change, rms", "noise, sd", "held-out error, rms", "beta (mm per unit)", "dt / beta"]
     assert at["change, rms"].get_yscale() == "log" and at["beta (mm per unit)"].get_yscale() == "linear"
@@ -282,8 +284,8 @@ def test_courses_over_the_iterations():
     ],
 )
 def test_courses_of_records_that_lack_something(record, expected):
-    assert drawing.courses(record) == expected
-    assert drawing.has_iterations(record) == bool(expected)
+    assert graphs.courses(record) == expected
+    assert graphs.has_iterations(record) == bool(expected)
 
 
 @pytest.mark.parametrize(
@@ -297,7 +299,7 @@ def test_courses_of_records_that_lack_something(record, expected):
 def test_the_wheel(tmp_path, low, period, labels):
     figure = Figure(figsize=(2, 3))
     scale = Scale(low, low + period, period=True)
-    drawing.key(figure, scale)
+    key.draw(figure, scale)
     (axes,) = figure.axes
     assert [text.get_text() for text in axes.texts] == labels
     picture = axes.get_images()[0].get_array()
@@ -307,10 +309,10 @@ def test_the_wheel(tmp_path, low, period, labels):
 
 def test_the_key_says_what_grey_and_outlines_mean():
     figure = Figure(figsize=(2, 4))
-    drawing.key(figure, Scale(0, 1), label="map", missing=True, filled=True)
+    key.draw(figure, Scale(0, 1), label="map", missing=True, filled=True)
     bar, *swatches = figure.axes
     assert bar.get_title() == "map"
-    assert [axes.texts[0].get_text() for axes in swatches] == ["no data", "filled in: no data\nbefore the run"]
+    assert [axes.texts[0].get_text() for axes in swatches] == ["no data", "filled in: paler,\nno data before"]
     assert swatches[0].get_facecolor()[:3] == MISSING
 
 
@@ -323,7 +325,7 @@ KINDS = {
     "curve": lambda: run_on(loop(), PLANE),
     "flat": lambda: run_on(None, SPACE),
     "flat plane": lambda: run_on(None, PLANE),
-    "one map": lambda: replace(run_on(box(), SPACE, is_run=False, record=None), maps=run_on(box(), SPACE).maps[:1]),
+    "one map": lambda: replace(run_on(box(), SPACE, compares=False, record=None), maps=run_on(box(), SPACE).maps[:1]),
 }
 
 
@@ -347,7 +349,7 @@ def test_a_sheet_of_a_record_that_lacks_something(record, tmp_path):
 def test_a_sheet_without_any_value(tmp_path):
     mesh = box()
     nothing = Map("nothing", np.full(len(mesh.vertices_ras_mm), np.nan))
-    sheet.draw(tmp_path / "sheet.png", Subject("s", (nothing, nothing), mesh, is_run=True))
+    sheet.draw(tmp_path / "sheet.png", Subject("s", (nothing, nothing), mesh, compares=True, difference="removed"))
     assert share(imread(tmp_path / "sheet.png")[..., :3], MISSING) > 0.01
 
 
@@ -430,4 +432,4 @@ def test_no_global_state_of_matplotlib_is_touched(tmp_path):
 
 
 def test_shades_of_lines_stay_apart():
-    assert len({to_rgb(colour) for colour in drawing.LINES}) == len(drawing.LINES) >= 6
+    assert len({to_rgb(colour) for colour in style.LINES}) == len(style.LINES) >= 6

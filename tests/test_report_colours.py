@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from beltrami_cli.report.colours import MISSING, MISSING_SULCUS, Scale, removed_scale, scale_of
+from beltrami_cli.report.colours import MISSING, MISSING_SULCUS, Scale, difference_scale, scale_of
 from beltrami_cli.report.subject import Map, Subject
 
 SEQUENTIAL, ANGLES, DIFFERENCES = Scale(0, 1), Scale(0, 360, period=True), Scale(-1, 1, differences=True)
@@ -84,7 +84,7 @@ def test_an_angle_has_one_colour_whatever_its_range():
         ([0.0, 100.0], [2.0, 4.0], (2.04, 3.96)),  # noise in the input does not flatten the result
         ([np.nan, 1.0, 9.0], [50.0, 2.0, 4.0], (2.04, 3.96)),  # nor does what was filled in
         ([1.0, 2.0], [3.0, 3.0], (1.02, 1.98)),
-        ([7.0, 7.0], [7.0, 7.0], (0.0, 1.0)),
+        ([7.0, 7.0], [7.0, 7.0], (3.5, 10.5)),
         ([np.nan], [np.nan], (0.0, 1.0)),
     ],
 )
@@ -104,7 +104,7 @@ def test_the_scale_of_angles_is_the_whole_period():
 
 def test_the_scale_of_what_was_removed_is_even_about_0():
     before, after = Map("a", np.array([0.0, 3.0, 350.0, np.nan])), Map("b", np.array([0.0, 0.0, 10.0, 1.0]))
-    scale = removed_scale(Subject("s", (before, after), period=360.0, is_run=True))
+    scale = difference_scale(Subject("s", (before, after), period=360.0, compares=True, difference="removed"))
     assert scale.differences and scale.low == -scale.high
     assert scale.high == pytest.approx(np.percentile([0, 3, 20], 98))
-    assert removed_scale(Subject("s", (before, before), is_run=True)).high == 1.0
+    assert difference_scale(Subject("s", (before, before), compares=True, difference="removed")).high == 1.0

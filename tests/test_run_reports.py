@@ -40,7 +40,7 @@ def test_a_report_is_told_of_input_and_output(scene, shown):
     psi, data, out = scene
     done("denoise", psi, data, "-o", out, "--report", out.with_name("r.png"), "--stop", "auto")
     subject, told = only(shown), record(out.with_name("out.json"))
-    assert subject.is_run
+    assert subject.compares
     assert (subject.title, [each.title for each in subject.maps]) == ("data.nii.gz", ["input", "denoised"])
     assert subject.grid is not None
     assert np.allclose(subject.maps[0].volume, load(data))
@@ -104,7 +104,7 @@ def test_angles(tmp_path, shown):
     done("denoise", psi, angle, *out, "--kind", "circular", "--period", "360", *FEW)
     subject = only(shown)
     assert (subject.period, subject.low) == (360, -180)
-    assert np.abs(subject.removed()).max() <= 180
+    assert np.abs(subject.differences()).max() <= 180
 
 
 def test_channels_complex_and_frames(tmp_path, shown):
@@ -155,7 +155,7 @@ def test_a_curve_and_a_flat_run(tmp_path, shown):
     assert curve.maps[0].volume.shape == flat.maps[0].volume.shape == (24, 24, 1)
     assert flat.mesh is None
     assert flat.maps[1].values is None
-    assert len(flat.removed()) == 24 * 24
+    assert len(flat.differences()) == 24 * 24
 
 
 def test_axes_are_those_of_the_head(tmp_path, shown):

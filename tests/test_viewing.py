@@ -45,7 +45,7 @@ def test_volumes_on_a_level_set(files, shown):
     assert run.out == f"wrote {files['out']}\n"
     (subject,) = shown
     assert titles(subject) == ["a", "b"]
-    assert not subject.is_run
+    assert not subject.compares
     assert np.allclose(subject.maps[0].volume, load(files["a"]))
     assert subject.maps[0].values.mean() == pytest.approx(50, abs=1.5)
     assert subject.maps[1].values.mean() == pytest.approx(70, abs=1.5)
@@ -64,9 +64,9 @@ def test_what_is_shown_is_what_a_mesh_of_it_holds(files, shown):
 def test_compare_shows_the_difference(files, shown):
     done("view", "--compare", files["a"], files["b"], "--levelset", files["psi"], "-o", files["out"])
     (subject,) = shown
-    assert subject.is_run
+    assert subject.compares
     assert titles(subject) == ["a", "b"]
-    assert subject.removed().mean() == pytest.approx(-20, abs=2)
+    assert subject.differences().mean() == pytest.approx(-20, abs=2)
 
 
 def test_values_at_vertices_and_meshes(files, shown):
@@ -77,7 +77,7 @@ def test_values_at_vertices_and_meshes(files, shown):
     metric, meshes, bare, volume = shown
     assert metric.grid is None
     assert metric.maps[0].values.mean() == pytest.approx(50, abs=1.5)
-    assert meshes.removed().mean() == pytest.approx(-20, abs=2)
+    assert meshes.differences().mean() == pytest.approx(-20, abs=2)
     assert bare.maps[0].values.shape[1] == 1
     assert volume.grid is not None
     assert len(volume.maps[0].values) == len(metric.maps[0].values)

@@ -10,6 +10,11 @@ from beltrami_cli.cli.common import Command, announce_compilation, frame_option,
 
 FILE = click.Path(path_type=Path)
 
+SIDES = (
+    *("lateral", "medial", "dorsal", "ventral", "anterior", "posterior"),
+    *("left", "right", "front", "back", "above", "below", "three-quarter"),
+)
+
 
 @click.command(cls=Command)
 @click.argument("volumes", nargs=-1, type=FILE, metavar="VOLUME...")
@@ -21,6 +26,13 @@ FILE = click.Path(path_type=Path)
     "-o", "--output", type=FILE, required=True, metavar="FILE", help=".html: a page for any browser. .png: a sheet."
 )
 @click.option("--titles", metavar="T1,T2..", help="Of the maps, in their order. Default: the names of the files.")
+@click.option(
+    "--side",
+    type=click.Choice(SIDES),
+    metavar="SIDE",
+    help=f"From where the surface is seen first: {', '.join(SIDES)}. Default: where most of the data are seen.",
+)
+@click.option("--colours", metavar="NAME", help="A colour map of matplotlib or colorcet (cet_NAME): gray, cividis ...")
 @click.option("--period", metavar="P", help="The values are angles of this period: 360, 2pi, 24 ...")
 @click.option("--missing", type=float, metavar="VALUE", help="A value that means none, as NaN always does.")
 @click.option("--map", metavar="NAME|N", help="Which map of values at vertices, where a file has several.")
@@ -37,6 +49,8 @@ def view(
     compare: Path | None,
     output: Path,
     titles: str | None,
+    side: str | None,
+    colours: str | None,
     period: str | None,
     missing: float | None,
     map: str | None,
@@ -70,6 +84,8 @@ def view(
         levelset=levelset,
         titles=() if titles is None else tuple(title.strip() for title in titles.split(",")),
         compare=compare is not None,
+        side=side,
+        colours=colours,
         period=None if period is None else parse_period(period),
         missing=missing,
         inside=inside,

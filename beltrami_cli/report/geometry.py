@@ -12,6 +12,16 @@ from beltrami_cli.surface import Mesh, edge_counts, edges_of
 
 # Where a surface shows no side of its own it is seen from the right, the front and above (RAS), as a solid on a table.
 THREE_QUARTER = np.array([0.45, -0.6, 0.66])
+# From where a surface may be seen: towards the viewer, in RAS, of a left hemisphere.
+SIDES = {
+    **{name: np.array([-1.0, 0, 0]) for name in ("left", "lateral")},
+    **{name: np.array([1.0, 0, 0]) for name in ("right", "medial")},
+    **{name: np.array([0, 1.0, 0]) for name in ("front", "anterior")},
+    **{name: np.array([0, -1.0, 0]) for name in ("back", "posterior")},
+    **{name: np.array([0, 0, 1.0]) for name in ("above", "dorsal")},
+    **{name: np.array([0, 0, -1.0]) for name in ("below", "ventral")},
+    "three-quarter": THREE_QUARTER,
+}
 # Share of the area by which one side must prevail to be the one that is looked at; a closed surface has 0.
 ONE_SIDED = 0.1
 
@@ -74,15 +84,19 @@ def views(mesh: Mesh) -> list[View]:
 
     A cortex of both hemispheres hides its medial sides: it is seen from the left and the right.
     """
-    right, front, up = np.eye(3)
-    if is_cortex(mesh):
-        both = _has_both_hemispheres(mesh)
-        first, second = ("left", "right") if both else ("lateral", "medial")
-        out = -right if both or hemisphere(mesh) == "left" else right
-        named = {first: out, second: -out, "dorsal": up, "posterior": -front}
+    if not is_cortex(mesh):
+        names = ("right", "front", "above", "three-quarter")
+    elif _has_both_hemispheres(mesh):
+        names = ("left", "right", "dorsal", "posterior")
     else:
-        named = {"right": right, "front": front, "above": up, "three-quarter": THREE_QUARTER}
-    return [View(name, camera(towards)) for name, towards in named.items()]
+        names = ("lateral", "medial", "dorsal", "posterior")
+    return [from_side(mesh, name) for name in names]
+
+
+def from_side(mesh: Mesh, name: str) -> View:
+    """The view from a side, a name in `SIDES`."""
+    mirrored = name in ("lateral", "medial") and hemisphere(mesh) == "right"
+    return View(name, camera(-SIDES[name] if mirrored else SIDES[name]))
 
 
 def best_view(mesh: Mesh, known: np.ndarray) -> View:

@@ -47,7 +47,6 @@ if (channelSelect) {
 
 // The surface in 3-D.
 
-const OUTLINE = "#d6006c"; // no colour of either map
 const HALF_ANGLE = Math.tan(Math.PI / 8); // plotly's perspective opens by 45 degrees
 
 if (byId("scene")) drawSurface(JSON.parse(byId("scene").textContent));
@@ -109,12 +108,15 @@ function drawSurface(scene) {
   }
 
   // One colour per vertex: a scale that wraps must not be interpolated as a number.
-  function vertexColours(values) {
+  function vertexColours(map) {
     const { low, high, cyclic } = scene.scales[channel];
-    return Array.from(values, (value) => {
+    const faded = (colour) => colour.map((part, c) => scene.fading * scene.greys[0][c] + (1 - scene.fading) * part);
+    const pale = colours.map(faded);
+    return Array.from(map.values[channel], (value, v) => {
       let share = (value - low) / (high - low);
       share = cyclic ? share - Math.floor(share) : Math.min(Math.max(share, 0), 1);
-      return colours[Math.min(Math.floor(share * 256), 255)] || scene.greys[0];
+      const from = map.filled && map.filled[v] ? pale : colours;
+      return from[Math.min(Math.floor(share * 256), 255)] || scene.greys[0];
     });
   }
 
@@ -139,11 +141,11 @@ function drawSurface(scene) {
     const isDark = (v) => sulcus && form.name === "inflated" && sulcus[v];
     const greys = Array.from(form.x, (_, v) => scene.greys[isDark(v) ? 1 : 0]);
     return [
-      { ...common, ...known, vertexcolor: vertexColours(values), visible: known.i.length > 0 },
+      { ...common, ...known, vertexcolor: vertexColours(map), visible: known.i.length > 0 },
       { ...common, ...missing, vertexcolor: greys, visible: missing.i.length > 0 && shown.m },
       {
         type: "scatter3d", mode: "lines", ...form.borders, connectgaps: false,
-        line: { color: OUTLINE, width: 4 }, visible: form.borders.x.length > 0 && shown.f,
+        line: { color: scene.outline, width: 4 }, visible: form.borders.x.length > 0 && shown.f,
       },
     ];
   }
@@ -354,7 +356,8 @@ function drawSurface(scene) {
         label.style.left = `${100 + 74 * [1, 0, -1, 0][quarter]}px`;
         label.style.top = `${85 - 63 * [0, 1, 0, -1][quarter]}px`;
       }
-      for (const [x, y, words] of [[1, 1, "upper right"], [-1, 1, "upper left"], [-1, -1, "lower left"], [1, -1, "lower right"]]) {
+      // Polar angles of the visual field, where 90 is up.
+      for (const [x, y, words] of !scene.isVisualField ? [] : [[1, 1, "upper right"], [-1, 1, "upper left"], [-1, -1, "lower left"], [1, -1, "lower right"]]) {
         const label = part("quadrant", wheel, words);
         label.style.left = `${100 + 70 * x}px`;
         label.style.top = `${85 - 58 * y}px`;
@@ -367,12 +370,12 @@ function drawSurface(scene) {
       }
     }
     const is = { missing: maps.some((map) => map.values[channel].some(Number.isNaN)), filled: forms[0].borders.x.length > 0 };
-    for (const [kind, text] of [["missing", "missing"], ["filled", "outline of what was filled in"]]) {
+    for (const [kind, text] of [["missing", "missing"], ["filled", "filled in: paler, outlined"]]) {
       if (!is[kind]) continue;
       const line = part("legend", box);
       const swatch = line.appendChild(document.createElement("span"));
       swatch.className = `swatch ${kind}`;
-      if (kind === "filled") swatch.style.borderColor = OUTLINE;
+      if (kind === "filled") swatch.style.borderColor = scene.outline;
       else swatch.style.background = `rgb(${scene.greys[0].map((part) => 255 * part).join(" ")})`;
       line.append(text);
     }

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from beltrami_cli.formats import checks
-from beltrami_cli.report import colours, drawing, geometry
+from beltrami_cli.report import colours, geometry, graphs, key, slices, style
 from beltrami_cli.report.colours import Scale
 from beltrami_cli.report.subject import Subject
 from beltrami_cli.surface import Mesh
@@ -161,10 +161,15 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
             for shown in maps
         ],
         "scales": [{"low": scale.low, "high": scale.high, "cyclic": scale.period} for scale in scales],
+        "isVisualField": subject.period == key.VISUAL_FIELD,
         "colours": _packed(scales[0].table(), np.uint8),
         "greys": [colours.MISSING, colours.MISSING_SULCUS],
+        "fading": colours.FADING,
+        "outline": colours.FILLED,
         "views": [{"name": view.name, "camera": view.camera.tolist()} for view in geometry.views(whole)],
-        "best": geometry.best_view(whole, first).camera.tolist(),
+        "best": (
+            geometry.best_view(whole, first) if subject.side is None else geometry.from_side(whole, subject.side)
+        ).camera.tolist(),
     }
     return scene, notes
 
@@ -221,26 +226,26 @@ def _pictures(subject: Subject, channels: int) -> Iterator[Picture]:
         scale = colours.scale_of(one)
         if subject.is_curve:
             alt = f"Values along the curve over the arc length: {titles}."
-            yield Picture("Along the curve", _drawn(drawing.curve, 3.0, one), alt, of)
+            yield Picture("Along the curve", _drawn(graphs.curve, 3.0, one), alt, of)
         if one.maps[0].volume is not None:
             alt = f"Slices through the volumes with the surface's outline: {titles}."
             is_plane = subject.grid is not None and 1 in subject.grid.shape
-            rows = 1 if is_plane else len(subject.maps) + subject.is_run
+            rows = 1 if is_plane else len(subject.maps) + subject.compares
             yield Picture("Slices", _drawn(_slices, 1.75 * rows + 0.4, one, scale), alt, of)
-        what = f"How often each value occurs: {titles}" + ("; and what was removed." if subject.is_run else ".")
-        yield Picture("Histograms", _drawn(drawing.histograms, 2.2, one), what, of)
-    if drawing.has_iterations(subject.record):
+        what = f"How often each value occurs: {titles}" + (f"; and {subject.difference}." if subject.compares else ".")
+        yield Picture("Histograms", _drawn(graphs.histograms, 2.2, one), what, of)
+    if graphs.has_iterations(subject.record):
         alt = "Over the iterations: change, and where known noise, beta and held-out error."
-        width = max(INCHES, 2.1 * drawing.courses(subject.record))
-        drawn = _drawn(drawing.iterations, 2.2, subject.record, subject.period, width=width)
+        width = max(INCHES, 2.1 * graphs.courses(subject.record))
+        drawn = _drawn(graphs.iterations, 2.2, subject.record, subject.period, width=width)
         yield Picture("Over the iterations", drawn, alt)
 
 
 def _slices(figure: Any, subject: Subject, scale: Scale) -> None:
     """Slices, and beside them what their colours mean."""
     left, right = figure.subfigures(1, 2, width_ratios=[INCHES - 1.4, 1.4])
-    drawing.slices(left, subject, scale)
-    drawing.key(right, scale)
+    slices.draw(left, subject, scale)
+    key.draw(right, scale)
 
 
 def _drawn(draw: Callable[..., None], height: float, *what: Any, width: float = INCHES) -> str:
@@ -249,7 +254,7 @@ def _drawn(draw: Callable[..., None], height: float, *what: Any, width: float = 
     from matplotlib.figure import Figure
 
     # A fixed salt and no date: the same subject makes the same bytes.
-    with rc_context({**drawing.STYLE, "svg.fonttype": "path", "svg.hashsalt": "beltrami"}):
+    with rc_context({**style.STYLE, "svg.fonttype": "path", "svg.hashsalt": "beltrami"}):
         figure = Figure(figsize=(width, height), facecolor="white")
         draw(figure, *what)
         file = io.BytesIO()
@@ -327,8 +332,8 @@ def tables(record: Mapping[str, Any]) -> Iterator[Table]:
 
 def _flat(record: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
     """Pairs of a name and a value, those of records within it too."""
-    for key, value in record.items():
-        name = f"{above}: {_spelt(key)}" if above else _spelt(key)
+    for field, value in record.items():
+        name = f"{above}: {_spelt(field)}" if above else _spelt(field)
         if isinstance(value, Mapping):
             yield from _flat(value, name)
         else:

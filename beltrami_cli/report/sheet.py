@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from beltrami_cli.formats import checks
-from beltrami_cli.report import drawing, geometry
-from beltrami_cli.report.colours import MISSING_SULCUS, Scale, scale_of
-from beltrami_cli.report.drawing import FAINT, unit
+from beltrami_cli.report import geometry, graphs, key, slices, style, surfaces
+from beltrami_cli.report.colours import MISSING_SULCUS, Scale, faded, scale_of, values_of
 from beltrami_cli.report.geometry import View
+from beltrami_cli.report.style import FAINT, unit
 from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.surface import Mesh
 
@@ -44,7 +44,7 @@ class Seen:
 
     folded, form: coarser copies, as it is and as it is shown first (inflated for a cortex). source: (V',) the vertex
     whose value each vertex shows. sulci: (V',) bool. known: (V',) bool, where the first map has data. views: the one
-    first that sees most of the data.
+    first that is chosen, or else that sees most of the data.
     """
 
     folded: Mesh
@@ -54,23 +54,31 @@ class Seen:
     known: np.ndarray
     views: list[View]
     is_cortex: bool
+    chosen: bool
 
-    def colours(self, scale: Scale, values: np.ndarray) -> np.ndarray:
-        """(V', 4) colours of values (V,) of the whole surface."""
-        shown = values[self.source]
-        colours = scale.rgba(shown)
-        colours[~np.isfinite(shown) & self.sulci, :3] = MISSING_SULCUS
+    def colours(self, scale: Scale, shown: Map) -> np.ndarray:
+        """(V', 4) colours of a map of the whole surface."""
+        assert shown.values is not None
+        values = shown.values[self.source]
+        colours = faded(scale.rgba(values), self.filled(shown))
+        colours[~np.isfinite(values) & self.sulci, :3] = MISSING_SULCUS
         return colours
+
+    def filled(self, shown: Map) -> np.ndarray | None:
+        """(V',) bool, where a map was filled in."""
+        return None if shown.filled is None else shown.filled[self.source]
 
     def panels(self) -> list[Panel]:
         """Four sides, and before them the data from close by where they take a small part of what is seen."""
         shape = ", inflated" if self.is_cortex else ""
         close = self.close_up()
-        sides = [Panel(view.name + shape, view, drawing.whole(self.form, view)) for view in self.views]
+        sides = [Panel(view.name + shape, view, surfaces.whole(self.form, view)) for view in self.views]
         return ([close] if close is not None else []) + sides
 
     def close_up(self) -> Panel | None:
         """The data from the side to which most of them face; None where that is nearly all of the surface."""
+        if self.chosen:
+            return None
         view = geometry.best_view(self.form, self.known)
         facing = self.known & (geometry.vertex_normals(self.form) @ view.camera[2] > 0)
         if not facing.any():
@@ -79,7 +87,7 @@ class Seen:
         box = np.percentile(flat, (0.1, 99.9), axis=0)
         margin = MARGIN * np.ptp(box, axis=0).max()
         box += [[-margin], [margin]]
-        around = drawing.whole(self.form, view)
+        around = surfaces.whole(self.form, view)
         box = np.stack([np.maximum(box[0], around[0]), np.minimum(box[1], around[1])])
         is_small = np.ptp(box, axis=0).prod() < CLOSE_UP * np.ptp(around, axis=0).prod()
         return Panel(f"{view.name}, close by", view, box) if is_small else None
@@ -95,7 +103,7 @@ def draw(path: Path, subject: Subject) -> None:
     seen = None if shown.mesh is None or shown.is_curve else _seen(shown)
     blocks = _few(shown, scale, seen) if len(shown.maps) <= 2 else _many(shown, scale, seen)
     blocks = [_headline(subject, seen), *blocks]
-    with rc_context(drawing.STYLE):
+    with rc_context(style.STYLE):
         figure = Figure(figsize=(WIDTH, sum(height for height, _ in blocks)), dpi=DPI, facecolor="white")
         parts = figure.subfigures(len(blocks), 1, height_ratios=[height for height, _ in blocks], squeeze=False)
         for part, (_, fill) in zip(parts[:, 0], blocks, strict=True):
@@ -117,26 +125,28 @@ def _seen(subject: Subject) -> Seen:
     whole = known[folded.cells].all(1)
     area = geometry.area_vectors(form)[whole if whole.any() else slice(None)]
     views = sorted(geometry.views(folded), key=lambda view: -np.maximum(area @ view.camera[2], 0).sum())
+    if subject.side is not None:
+        views = [geometry.from_side(folded, subject.side), *(v for v in views if v.name != subject.side)][:4]
     sulci = geometry.curvature(folded) < 0 if is_cortex else np.zeros(len(source), bool)
-    return Seen(folded, form, source, sulci, known, views, is_cortex)
+    return Seen(folded, form, source, sulci, known, views, is_cortex, chosen=subject.side is not None)
 
 
 def _few(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:
     """A run, or one or two maps: from four sides, in slices, and in figures."""
     words = [_words(subject.record)] if subject.record else []
     if seen is None:
-        line: list[Block] = [(3.4, lambda part: drawing.curve(part, subject))] if subject.is_curve else []
-        slices = _beside(
+        line: list[Block] = [(3.4, lambda part: graphs.curve(part, subject))] if subject.is_curve else []
+        cut = _beside(
             (
                 WIDTH - KEY,
-                drawing.slices_height(subject, WIDTH - KEY),
-                lambda part: drawing.slices(part, subject, scale),
+                slices.height(subject, WIDTH - KEY),
+                lambda part: slices.draw(part, subject, scale),
             ),
             (KEY, 0.0, lambda part: _key(part, subject, scale)),
         )
-        return [*line, slices, _graphs(subject), *words]
+        return [*line, cut, _graphs(subject), *words]
     left = 0.6 * WIDTH
-    cut = (left, drawing.slices_height(subject, left), lambda part: drawing.slices(part, subject, scale))
+    cut = (left, slices.height(subject, left), lambda part: slices.draw(part, subject, scale))
     if seen.is_cortex:
         below = [_beside(cut, (WIDTH - left, 0.0, lambda part: _folds(part, subject, scale, seen))), _graphs(subject)]
     else:
@@ -169,7 +179,7 @@ def _views(subject: Subject, scale: Scale, seen: Seen) -> Block:
 
     def fill(part: Any) -> None:
         left_part, right_part = part.subfigures(1, 2, width_ratios=[WIDTH - KEY, KEY])
-        all_axes = drawing.grid_of_axes(
+        all_axes = style.grid_of_axes(
             left_part, rows, len(panels), left=left, right=right, top=0.5, bottom=0.2, gap=(gap, between),
             widths=sizes[:, 0],
         )  # fmt: skip
@@ -182,37 +192,32 @@ def _views(subject: Subject, scale: Scale, seen: Seen) -> Block:
             )  # fmt: skip
         for panel, axes in zip(panels, all_axes[0], strict=True):
             axes.set_title(panel.title, pad=15)
-            drawing.directions(axes, panel.view)
+            surfaces.directions(axes, panel.view)
         _key(right_part, subject, scale)
 
     return rows * row + (rows - 1) * between + 0.7, fill
 
 
 def _paint(axes: Any, shown: Map, seen: Seen, scale: Scale, panel: Panel) -> None:
-    assert shown.values is not None
-    filled = None if shown.filled is None else shown.filled[seen.source]
-    drawing.surface(axes, seen.form, seen.colours(scale, shown.values), panel.view, filled, panel.box)
+    surfaces.draw(axes, seen.form, seen.colours(scale, shown), panel.view, seen.filled(shown), panel.box)
 
 
 def _key(part: Any, subject: Subject, scale: Scale) -> None:
-    missing = any(
-        not np.isfinite(v).all() for shown in subject.maps for v in (shown.values, shown.volume) if v is not None
-    )
+    missing = any(not np.isfinite(values_of(shown)).all() for shown in subject.maps)
     filled = any(shown.filled is not None and bool(shown.filled.any()) for shown in subject.maps)
-    drawing.key(part, scale, missing=missing, filled=filled)
+    key.draw(part, scale, missing=missing, filled=filled)
 
 
 def _folds(part: Any, subject: Subject, scale: Scale, seen: Seen) -> None:
     """The surface as it is, from the two sides that see most of the data."""
     rows = len(subject.maps)
-    all_axes = drawing.grid_of_axes(part, rows, 2, left=0.1, top=0.45, bottom=0.2, gap=(0.4, 0.2))
+    all_axes = style.grid_of_axes(part, rows, 2, left=0.1, top=0.45, bottom=0.2, gap=(0.4, 0.2))
     for shown, line in zip(subject.maps, all_axes, strict=True):
-        assert shown.values is not None
         for view, axes in zip(seen.views, line, strict=False):
-            drawing.surface(axes, seen.folded, seen.colours(scale, shown.values), view)
+            surfaces.draw(axes, seen.folded, seen.colours(scale, shown), view)
     for view, axes in zip(seen.views, all_axes[0], strict=False):
         axes.set_title(view.name + ", folded", pad=15)
-        drawing.directions(axes, view)
+        surfaces.directions(axes, view)
 
 
 def _graphs(subject: Subject) -> Block:
@@ -221,13 +226,13 @@ def _graphs(subject: Subject) -> Block:
 
 def _fill_graphs(part: Any, subject: Subject, columns: int | None = None) -> None:
     """Histograms, then the courses over the iterations, in rows of so many; by default in one."""
-    first = 2 if subject.is_run else 1
-    count = first + drawing.courses(subject.record)
+    first = 2 if subject.compares else 1
+    count = first + graphs.courses(subject.record)
     columns = columns or max(count, 3)
     rows = -(-count // columns)
-    axes = drawing.grid_of_axes(part, rows, columns, left=0.35, gap=(0.5, 0.6)).ravel()
-    drawing.draw_histograms(axes[:first], subject)
-    drawing.draw_iterations(axes[first:count], subject.record or {})
+    axes = style.grid_of_axes(part, rows, columns, left=0.35, gap=(0.5, 0.6)).ravel()
+    graphs.draw_histograms(axes[:first], subject)
+    graphs.draw_iterations(axes[first:count], subject.record or {})
     for spare in axes[count:]:
         spare.set_axis_off()
 
@@ -244,7 +249,7 @@ def _words(record: Mapping[str, Any]) -> Block:
     def fill(part: Any) -> None:
         top = 1.0
         if warnings:
-            part.text(0.025, top, "\n".join(warnings), va="top", fontsize=9, color=drawing.WARNING, linespacing=1.2)
+            part.text(0.025, top, "\n".join(warnings), va="top", fontsize=9, color=style.WARNING, linespacing=1.2)
             top -= (line * len(warnings) + 0.12) / height
         for k, (name, value) in enumerate(used):
             x = 0.025 + k // rows * 0.95 / columns
@@ -273,14 +278,14 @@ def _headline(subject: Subject, seen: Seen | None) -> Block:
     if seen is not None and subject.mesh is not None and len(subject.mesh.cells) > len(seen.folded.cells):
         small.append(f"drawn with {len(seen.folded.cells):,} of {len(subject.mesh.cells):,} triangles")
     figures = headline(subject)
-    lines = [(subject.title, {"fontsize": 14, "fontweight": "bold"})]
+    lines = [(subject.title, {"fontsize": 14, "fontweight": "bold"})] if subject.title else []
     lines += [(figures, {"fontsize": 11})] if figures else []
     lines += [(line, {"fontsize": 7.5, "color": FAINT}) for line in textwrap.wrap("; ".join(small), 190)]
     height = 0.15 + 0.28 * len(lines)
 
     def fill(part: Any) -> None:
-        for k, (line, style) in enumerate(lines):
-            part.text(0.025, 1 - (0.3 + 0.27 * k) / height, line, **style)
+        for k, (line, look) in enumerate(lines):
+            part.text(0.025, 1 - (0.3 + 0.27 * k) / height, line, **look)
 
     return height, fill
 
@@ -309,20 +314,20 @@ def headline(subject: Subject) -> str:
 def _many(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:
     """A figure as in a paper: a panel per map and one key."""
     if subject.is_curve:
-        return [(4.0, lambda part: drawing.curve(part, subject))]
+        return [(4.0, lambda part: graphs.curve(part, subject))]
     rows = -(-len(subject.maps) // 4)
     columns = -(-len(subject.maps) // rows)
     if seen is None:
-        return [(2.2 * len(subject.maps), lambda part: drawing.slices(part, subject, scale))]
-    best = geometry.best_view(seen.form, seen.known)
-    panel = seen.close_up() or Panel(best.name, best, drawing.whole(seen.form, best))
+        return [(2.2 * len(subject.maps), lambda part: slices.draw(part, subject, scale))]
+    best = seen.views[0] if seen.chosen else geometry.best_view(seen.form, seen.known)
+    panel = seen.close_up() or Panel(best.name, best, surfaces.whole(seen.form, best))
     across, up = np.ptp(panel.box, axis=0)
     width = (WIDTH - KEY - 0.4 - 0.3 * (columns - 1)) / columns
     height = min(width * up / across, 4.0)
 
     def fill(part: Any) -> None:
         left, right = part.subfigures(1, 2, width_ratios=[WIDTH - KEY, KEY])
-        all_axes = drawing.grid_of_axes(left, rows, columns, left=0.2, right=0.2, top=0.4, bottom=0.1, gap=(0.3, 0.4))
+        all_axes = style.grid_of_axes(left, rows, columns, left=0.2, right=0.2, top=0.4, bottom=0.1, gap=(0.3, 0.4))
         for axes in all_axes.flat[len(subject.maps) :]:
             axes.set_axis_off()
         for shown, axes in zip(subject.maps, all_axes.flat, strict=False):

@@ -34,8 +34,10 @@ class Subject:
     maps: at least one, of one shape. mesh: triangles, or a polyline for a curve in a plane; None for a flat run; its
     own values are not used. grid: of the maps' volumes, None without any; its axes are those of RAS as nearly as they
     can be: the first points right, the second to anterior, the third up (of a plane, the first two span it).
-    period: of angles, which lie in [low, low + period); None for other data. is_run: two maps, the input and the output
-    of a run: what was removed is their difference. record: the sidecar of the run. notes: lines on what is shown.
+    period: of angles, which lie in [low, low + period); None for other data. compares: the first of two maps less the
+    second is shown too, under the name `difference`. record: the sidecar of the run that led from one to the other.
+    side: from where a surface is seen first, a name in `geometry.SIDES`, None for where most of the data are seen.
+    colours: the name of a colour map in place of the default. notes: lines on what is shown.
     """
 
     title: str
@@ -44,8 +46,11 @@ class Subject:
     grid: Grid | None = None
     period: float | None = None
     low: float = 0.0
-    is_run: bool = False
+    compares: bool = False
+    difference: str = "difference"
     record: Mapping[str, Any] | None = None
+    side: str | None = None
+    colours: str | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -74,15 +79,20 @@ class Subject:
 
         return replace(self, maps=tuple(one(shown) for shown in self.maps))
 
-    def removed(self) -> np.ndarray:
-        """What the last map lacks of the first, (N,) finite differences at vertices, or voxels where there is no mesh.
+    def differences(self) -> np.ndarray:
+        """The first map less the last, (N,) finite values at vertices, or voxels where there is no mesh.
 
         Of one channel; for angles the shorter way round.
         """
         ends = self.maps[0], self.maps[-1]
         first, last = (shown.volume if shown.values is None else shown.values for shown in ends)
+        difference = np.ravel(self.between(first, last))
+        return difference[np.isfinite(difference)]
+
+    def between(self, first: np.ndarray | None, last: np.ndarray | None) -> np.ndarray:
+        """Values of one map less those of another, for angles the shorter way round."""
         assert first is not None and last is not None
-        difference = np.ravel(np.asarray(first, float) - last)
+        difference = np.asarray(first, float) - last
         if self.period is not None:
             difference = (difference + self.period / 2) % self.period - self.period / 2
-        return difference[np.isfinite(difference)]
+        return difference

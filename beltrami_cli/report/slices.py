@@ -1,0 +1,186 @@
+"""Panels that show slices through the volumes, with the outline of the surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from beltrami_cli.grid import Grid
+from beltrami_cli.report import geometry
+from beltrami_cli.report.colours import Scale, difference_scale, scale_of
+from beltrami_cli.report.key import bar
+from beltrami_cli.report.style import DIRECTIONS, FAINT, cased, grid_of_axes, unit
+from beltrami_cli.report.subject import Subject
+from beltrami_cli.surface import Mesh
+
+SLICES = ("sagittal", "coronal", "axial")
+
+
+@dataclass(frozen=True, eq=False)
+class Cuts:
+    """Where a subject is cut. index: of the slice for each axis. box: (2, 3) first and last voxel that are shown."""
+
+    grid: Grid
+    index: dict[int, int]
+    box: np.ndarray
+
+    def size(self, axis: int) -> tuple[float, float]:
+        """Width and height in mm of what is shown of a slice."""
+        size = (self.box[1] - self.box[0] + 1) * self.grid.spacing
+        first, second = np.delete(size, axis)
+        return float(first), float(second)
+
+    @property
+    def is_plane(self) -> bool:
+        return len(self.index) == 1
+
+
+def draw(figure: Any, subject: Subject, scale: Scale | None = None) -> None:
+    """Three orthogonal slices with the surface's outline: a row per map, and one of their difference with its bar.
+
+    Where most of the surface's data are, in mm, with the letters of RAS. A plane: one column per map. Without volumes
+    the outline has the colours. subject: of one channel.
+    """
+    scale = scale or scale_of(subject)
+    cuts = cuts_of(subject)
+    maps = [(shown.title, shown.volume, shown.values, scale) for shown in subject.maps]
+    if subject.compares:
+        maps.append((subject.difference, *_differences(subject), difference_scale(subject)))
+    sizes = [cuts.size(axis) for axis in cuts.index]
+    rows, columns = (1, len(maps)) if cuts.is_plane else (len(maps), len(sizes))
+    widths = [width for width, _ in sizes] * (columns if cuts.is_plane else 1)
+    all_axes = grid_of_axes(
+        figure, rows, columns, left=0.5, right=0.9, bottom=0.2, top=0.45, gap=(0.35, 0.2), widths=widths
+    )
+    places = [(one, cut) for one in maps for cut in cuts.index.items()]
+    for (one, (axis, index)), axes in zip(places, all_axes.flat, strict=True):
+        _slice(axes, subject.mesh, cuts, axis, index, *one[1:])
+    for (title, *_), axes in zip(maps, all_axes[0] if cuts.is_plane else all_axes[:, 0], strict=True):
+        if cuts.is_plane:
+            axes.set_title(title, pad=14)
+        else:
+            axes.annotate(
+                title, (0, 0.5), (-16, 0), "axes fraction", "offset points", rotation=90, va="center", ha="right"
+            )
+    if not cuts.is_plane:
+        for (axis, index), axes in zip(cuts.index.items(), all_axes[0], strict=True):
+            at = cuts.grid.to_world(np.where(np.arange(3) == axis, index, cuts.box.mean(0))[None])[0, axis]
+            axes.set_title(f"{SLICES[axis]}, {'xyz'[axis]} = {at:.0f} mm", pad=14)
+    for axes, (axis, _) in zip(all_axes[0], [cut for _, cut in places], strict=False):
+        _letters(axes, axis)
+    if subject.compares:
+        bar(all_axes[-1, -1].inset_axes((1.12, 0.1, 0.06, 0.8)), maps[-1][3], unit(subject.period))
+
+
+def height(subject: Subject, width: float) -> float:
+    """How many inches high `draw` is to be for its width in inches."""
+    cuts, maps = cuts_of(subject), len(subject.maps) + subject.compares
+    sizes = [cuts.size(axis) for axis in cuts.index]
+    columns, rows = (maps, 1) if cuts.is_plane else (len(sizes), maps)
+    across = sum(w for w, _ in sizes) * (maps if cuts.is_plane else 1)
+    scaled = (width - 1.4 - 0.35 * (columns - 1)) / across
+    return 0.65 + rows * min(scaled * max(h for _, h in sizes), 3.0) + 0.2 * (rows - 1)
+
+
+def cuts_of(subject: Subject) -> Cuts:
+    """Where `draw` cuts: of a plane, its missing axis only; else three slices of what the last map knows."""
+    grid = subject.grid or _grid_around(subject.mesh)
+    box = np.array([[0, 0, 0], grid.shape]) - [[0], [1]]
+    volume = subject.maps[-1].volume
+    shape = np.array(grid.shape)
+    if (shape == 1).any():
+        return Cuts(grid, {int(np.argmin(shape)): 0}, box)
+    if volume is not None:
+        known = np.argwhere(np.isfinite(volume))
+        if len(known):
+            box = np.stack([known.min(0), known.max(0)])
+    if subject.mesh is not None:
+        at = grid.to_index(subject.mesh.vertices_ras_mm[np.unique(subject.mesh.cells)])
+        box[0] = np.maximum(box[0], np.floor(at.min(0)) - 4)
+        box[1] = np.maximum(np.minimum(box[1], np.ceil(at.max(0)) + 4), box[0])
+    return Cuts(grid, _where_to_cut(subject, grid), box)
+
+
+def _slice(
+    axes: Any,
+    mesh: Mesh | None,
+    cuts: Cuts,
+    axis: int,
+    index: int,
+    volume: np.ndarray | None,
+    values: np.ndarray | None,
+    scale: Scale,
+) -> None:
+    """One slice, its first axis to the right and its second up."""
+    from matplotlib.collections import LineCollection
+
+    spacing = np.delete(cuts.grid.spacing, axis)
+    low, high = (np.delete(end, axis) for end in cuts.box)
+    (left, bottom), (right, top) = (low - 0.5) * spacing, (high + 0.5) * spacing
+    if volume is not None:
+        cut = volume.take(index, axis)[low[0] : high[0] + 1, low[1] : high[1] + 1].T
+        colours = scale.rgba(cut.reshape(-1)).reshape(*cut.shape, 4)
+        axes.imshow(colours, origin="lower", extent=(left, right, bottom, top), interpolation="nearest")
+    if mesh is not None:
+        segments, cells = geometry.outline(mesh, cuts.grid, axis, index)
+        if volume is None and values is not None:
+            shown = scale.rgba(values[mesh.cells[cells, 0]])
+            axes.add_collection(
+                LineCollection(list(segments), colors="black", linewidths=3.2, capstyle="round"), autolim=False
+            )
+            axes.add_collection(
+                LineCollection(list(segments), colors=shown, linewidths=2.4, capstyle="round"), autolim=False
+            )
+        else:
+            cased(axes, segments, 0.5)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+
+
+def _letters(axes: Any, axis: int) -> None:
+    """Where L, R, P, A, I, S are beside a slice."""
+    first, second = (DIRECTIONS[k] for k in range(3) if k != axis)
+    for (x, y), letter in zip(((-0.03, 0.5), (1.03, 0.5), (0.5, -0.03), (0.5, 1.03)), first + second, strict=True):
+        align = {"ha": "right" if x < 0 else "left" if x > 1 else "center"}
+        align["va"] = "top" if y < 0 else "bottom" if y > 1 else "center"
+        axes.text(x, y, letter, transform=axes.transAxes, color=FAINT, fontsize="small", **align)
+
+
+def _differences(subject: Subject) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """How the two maps differ: on the grid, and at the vertices; None where there are none."""
+    first, last = subject.maps[0], subject.maps[-1]
+    on_grid = None if first.volume is None else subject.between(first.volume, last.volume)
+    return on_grid, None if first.values is None else subject.between(first.values, last.values)
+
+
+def _where_to_cut(subject: Subject, grid: Grid) -> dict[int, int]:
+    """The index of the slice for each axis: the nearest to the middle of the data on the surface that cuts much."""
+    shape = grid.shape
+    middle = {axis: shape[axis] // 2 for axis in range(3)}
+    if subject.mesh is None:
+        return middle
+    values = subject.maps[0].values
+    known = np.isfinite(values) if values is not None else np.ones(len(subject.mesh.vertices_ras_mm), bool)
+    used = np.zeros(len(known), bool)
+    used[subject.mesh.cells] = True
+    at = np.rint(grid.to_index(subject.mesh.vertices_ras_mm[known & used if (known & used).any() else used]))
+    for axis in range(3):
+        inside = np.clip(at[:, axis], 0, shape[axis] - 1).astype(int)
+        counts = np.bincount(inside, minlength=shape[axis])
+        many = np.flatnonzero(counts >= counts.max() / 2)
+        middle[axis] = int(many[np.argmin(np.abs(many - np.median(inside)))])
+    return middle
+
+
+def _grid_around(mesh: Mesh | None) -> Grid:
+    """A grid to cut a surface by that has no volume: 200 slices across it."""
+    assert mesh is not None
+    used = mesh.vertices_ras_mm[np.unique(mesh.cells)]
+    low, size = used.min(0), np.ptp(used, axis=0)
+    spacing = max(float(size.max()) / 200, 1e-9)
+    affine = np.diag([spacing] * 3 + [1.0])
+    affine[:3, 3] = low - spacing
+    a, b, c = (int(n) for n in np.ceil(size / spacing) + 3)
+    return Grid((a, b, c), affine)
