@@ -136,7 +136,7 @@ def _few(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:
     words = [_words(subject.record)] if subject.record else []
     if seen is None:
         line: list[Block] = [(3.4, lambda part: graphs.curve(part, subject))] if subject.is_curve else []
-        cut = _beside(
+        beside_key = _beside(
             (
                 WIDTH - KEY,
                 slices.height(subject, WIDTH - KEY),
@@ -144,7 +144,7 @@ def _few(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:
             ),
             (KEY, 0.0, lambda part: _key(part, subject, scale)),
         )
-        return [*line, cut, _graphs(subject), *words]
+        return [*line, beside_key, _graphs(subject), *words]
     left = 0.6 * WIDTH
     cut = (left, slices.height(subject, left), lambda part: slices.draw(part, subject, scale))
     if seen.is_cortex:
