@@ -30,6 +30,7 @@ def commands(page: Path) -> list[list[str]]:
 
 def make(folder: Path) -> None:
     shutil.copytree(ROOT / "configs", folder / "configs", ignore=shutil.ignore_patterns("data", "output"))
+    shutil.copytree(ROOT / "sample_data", folder / "sample_data")
     os.chdir(folder)
     for command in commands(ROOT / "docs" / "gallery.md"):
         if code := main([*command, "--quiet"]):

@@ -10,13 +10,11 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import TriMesh
 from matplotlib.figure import Figure
-from matplotlib.tri import Triangulation
 from PIL import Image
 
 from beltrami_cli import Mesh, denoise, phantoms
-from beltrami_cli.report import colours, geometry
+from beltrami_cli.report import colours, geometry, surfaces
 
 BETAS = (0, 0.01, 0.03, 0.1, 0.3, 1)  # mm per grey level
 ITERATIONS = 20
@@ -24,21 +22,11 @@ INCHES, DPI, COLOURS = (4.2, 2.9), 150, 100  # 630 x 435 pixels of 100 colours: 
 
 
 def draw(path: Path, mesh: Mesh) -> None:
-    """The mesh with its values, seen from the right, the front and above."""
-    view = geometry.camera(np.array([0.45, -0.6, 0.66]))
-    across, up, depth = view @ (mesh.vertices_ras_mm - mesh.vertices_ras_mm.mean(0)).T
-    light = 0.55 + 0.45 * np.abs(geometry.vertex_normals(mesh) @ view[2])
-    shades = colours.Scale(0.0, 255.0).rgba(mesh.values)
-    shades[:, :3] *= light[:, None]
+    """The mesh with its values, seen from three quarters."""
     figure = Figure(INCHES, DPI, facecolor="white")
     axes = figure.add_axes((0, 0, 1, 1))
-    farthest_first = np.argsort(depth[mesh.cells].mean(1))
-    painted = TriMesh(Triangulation(across, up, mesh.cells[farthest_first]))
-    painted.set_facecolor(shades)
-    axes.add_collection(painted)
-    axes.autoscale_view()
-    axes.set_aspect("equal")
-    axes.set_axis_off()
+    shades = colours.Scale(0.0, 255.0).rgba(mesh.values)
+    surfaces.draw(axes, mesh, shades, geometry.from_side(mesh, "three-quarter"))
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(COLOURS).save(path, optimize=True)
