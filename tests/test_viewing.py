@@ -142,3 +142,29 @@ def test_refuses(files, tmp_path):
     for name in ("p.nii.gz", "p.ply"):
         (tmp_path / name).unlink()
     assert contents(tmp_path) == before
+
+
+def test_sides_and_colours(files, shown):
+    common = ("view", files["a"], "--levelset", files["psi"], "-o", files["out"], "--overwrite")
+    done(*common, "--side", "front", "--colours", "gray")
+    assert (shown[0].side, shown[0].colours) == ("front", "gray")
+    assert "expected the name of a colour map" in refused(*common, "--colours", "jett")
+    assert "expected the name of a colour map" in refused(*common, "--colours", "cet_nothing")
+    assert "'--side'" in refused(*common, "--side", "up")
+
+
+def test_the_sides_of_the_command_are_those_of_pictures():
+    from beltrami_cli.cli.view import SIDES
+    from beltrami_cli.report import geometry
+
+    assert set(SIDES) == set(geometry.SIDES)
+
+
+def test_vertices_in_a_tight_sulcus_are_no_specks(tmp_path, shown):
+    # Banks 1.2 voxels apart: many vertices have no voxel of their own.
+    done("phantom", "sulcus", tmp_path / "s", "--size", "32", "--gap", "1.2", "-q")
+    given = (tmp_path / "s" / "clean.nii.gz", "--levelset", tmp_path / "s" / "levelset.nii.gz")
+    done("view", *given, "-o", tmp_path / "o.png")
+    values = shown[0].maps[0].values
+    assert np.isfinite(values).mean() > 0.98
+    assert set(np.round(values[np.isfinite(values)])) == {0.0, 100.0}
