@@ -32,6 +32,9 @@ ENTRY, VERTEX = 50, 280
 STATES, MOST_KEPT = 14, 180_000_000
 # Numbers per voxel and channel while a volume is put together and written, the data still there: from 20 channels.
 COPIES = 3
+# Bytes for a picture of the run: its libraries and pages, per triangle that is drawn, up to so many, and per vertex of
+# the surface while it is made coarser.
+PICTURE, DRAWN, MOST_DRAWN, COARSER = 130_000_000, 1200, 60_000, 1000
 # Bytes per voxel of the part of a level set that holds the surface, while that is found, and per voxel of the grid.
 LEVELSET, VOXEL = 24, 4
 # Bytes per voxel of a segmentation, where two boundaries make its surface, and per vertex of the staircase in it.
@@ -75,7 +78,10 @@ def needed(job: Job, scene: Scene | None = None) -> int:
     states = entries * STATES * size * in_band
     flow = entries * (ENTRY + (ON_FACES if scene.at_vertices else 0)) + states + min(states, MOST_KEPT)
     held, data, writing = _volumes(job, scene, size, count, at_once)
-    peak = max(surface.making + data, data + flow, writing)
+    picture = 0.0
+    if job.report is not None:
+        picture = PICTURE + DRAWN * min(2 * surface.vertices, MOST_DRAWN) + COARSER * surface.vertices
+    peak = max(surface.making + data, data + flow, writing, data + picture)
     start = START + (METAIMAGE if any(_is_metaimage(path) for path in (job.volume, *job.all_inputs)) else 0)
     return int(start + held + places * (VERTEX + 2 * size * count) + peak)
 

@@ -80,6 +80,7 @@ def cases(folder: Path) -> Iterator[Case]:
     yield from planes_and_flat(folder)
     yield from meshes(folder)
     yield from segmentations(folder)
+    yield from reports(folder)
     if SHARED.is_dir():
         yield from cortices(folder)
 
@@ -126,6 +127,18 @@ def scalar(folder: Path) -> Iterator[Case]:
     yield "folded surface", {"input": files, **FEW}
     yield "folded surface, beta auto", {"input": files}
     yield "folded surface, float64", {"input": files, **FEW, "output": {"precision": "float64"}}
+
+
+def reports(folder: Path) -> Iterator[Case]:
+    """Runs that draw a picture at their end."""
+    for name, (psi, data) in {
+        "torus 64": (torus(64).levelset, torus(64).noisy),
+        "torus 160": (torus(160).levelset, torus(160).noisy),
+        "folded surface": folded_surface(),
+    }.items():
+        files = written(folder, "shown.nii.gz", psi=psi, data=data)
+        for suffix in ("png", "html"):
+            yield f"{name}, report {suffix}", {"input": files, **FEW, "output": {"report": f"out.{suffix}"}}
 
 
 def channels(folder: Path) -> Iterator[Case]:

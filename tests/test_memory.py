@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,15 @@ def test_needed_grows_with_precision_width_weights_and_the_library_for_metaimage
     weighed = Job(given.data, given.volume, given.levelset, weights=given.data, mask=given.data)
     assert needed(weighed) == plain + 2 * 4 * 40**3
     assert needed(Job(given.data, tmp_path / "out.mha", given.levelset)) - plain > 100e6
+
+
+def test_a_picture_needs_its_libraries_and_grows_no_more_than_the_surface(tmp_path):
+    def more(size: int) -> int:
+        plain = job(tmp_path, (size, size, size))
+        return needed(replace(plain, report=tmp_path / "r.png")) - needed(plain)
+
+    assert 100e6 < more(20) < 140e6
+    assert more(20) < more(80) < 200e6
 
 
 def test_needed_follows_the_surface_not_the_volume(tmp_path):

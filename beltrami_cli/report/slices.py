@@ -12,7 +12,7 @@ from beltrami_cli.report import geometry
 from beltrami_cli.report.colours import Scale, difference_scale, scale_of
 from beltrami_cli.report.key import bar
 from beltrami_cli.report.style import DIRECTIONS, FAINT, cased, grid_of_axes, unit
-from beltrami_cli.report.subject import Subject
+from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.surface import Mesh
 
 SLICES = ("sagittal", "coronal", "axial")
@@ -45,9 +45,9 @@ def draw(figure: Any, subject: Subject, scale: Scale | None = None) -> None:
     """
     scale = scale or scale_of(subject)
     cuts = cuts_of(subject)
-    maps = [(shown.title, shown.volume, shown.values, scale) for shown in subject.maps]
+    maps: list[tuple[str, Map, Map | None, Scale]] = [(shown.title, shown, None, scale) for shown in subject.maps]
     if subject.compares:
-        maps.append((subject.difference, *_differences(subject), difference_scale(subject)))
+        maps.append((subject.difference, subject.maps[0], subject.maps[-1], difference_scale(subject)))
     sizes = [cuts.size(axis) for axis in cuts.index]
     rows, columns = (1, len(maps)) if cuts.is_plane else (len(maps), len(sizes))
     widths = [width for width, _ in sizes] * (columns if cuts.is_plane else 1)
@@ -56,7 +56,7 @@ def draw(figure: Any, subject: Subject, scale: Scale | None = None) -> None:
     )
     places = [(one, cut) for one in maps for cut in cuts.index.items()]
     for (one, (axis, index)), axes in zip(places, all_axes.flat, strict=True):
-        _slice(axes, subject.mesh, cuts, axis, index, *one[1:])
+        _slice(axes, subject, cuts, axis, index, *one[1:])
     for (title, *_), axes in zip(maps, all_axes[0] if cuts.is_plane else all_axes[:, 0], strict=True):
         if cuts.is_plane:
             axes.set_title(title, pad=14)
@@ -93,9 +93,10 @@ def cuts_of(subject: Subject) -> Cuts:
     if (shape == 1).any():
         return Cuts(grid, {int(np.argmin(shape)): 0}, box)
     if volume is not None:
-        known = np.argwhere(np.isfinite(volume))
-        if len(known):
-            box = np.stack([known.min(0), known.max(0)])
+        known = np.isfinite(volume)
+        if known.any():
+            along = [np.flatnonzero(known.any(tuple(k for k in range(3) if k != axis))) for axis in range(3)]
+            box = np.array([[places[0] for places in along], [places[-1] for places in along]])
     if subject.mesh is not None:
         at = grid.to_index(subject.mesh.vertices_ras_mm[np.unique(subject.mesh.cells)])
         box[0] = np.maximum(box[0], np.floor(at.min(0)) - 4)
@@ -105,33 +106,41 @@ def cuts_of(subject: Subject) -> Cuts:
 
 def _slice(
     axes: Any,
-    mesh: Mesh | None,
+    subject: Subject,
     cuts: Cuts,
     axis: int,
     index: int,
-    volume: np.ndarray | None,
-    values: np.ndarray | None,
+    shown: Map,
+    less: Map | None,
     scale: Scale,
 ) -> None:
-    """One slice, its first axis to the right and its second up."""
+    """One slice of a map, or of the difference to another, its first axis to the right and its second up."""
     from matplotlib.collections import LineCollection
 
+    mesh, volume, values = subject.mesh, shown.volume, shown.values
     spacing = np.delete(cuts.grid.spacing, axis)
     low, high = (np.delete(end, axis) for end in cuts.box)
     (left, bottom), (right, top) = (low - 0.5) * spacing, (high + 0.5) * spacing
     if volume is not None:
-        cut = volume.take(index, axis)[low[0] : high[0] + 1, low[1] : high[1] + 1].T
+        cut = volume.take(index, axis)
+        if less is not None and less.volume is not None:
+            cut = subject.between(cut, less.volume.take(index, axis))
+        cut = cut[low[0] : high[0] + 1, low[1] : high[1] + 1].T
         colours = scale.rgba(cut.reshape(-1)).reshape(*cut.shape, 4)
         axes.imshow(colours, origin="lower", extent=(left, right, bottom, top), interpolation="nearest")
     if mesh is not None:
         segments, cells = geometry.outline(mesh, cuts.grid, axis, index)
         if volume is None and values is not None:
-            shown = scale.rgba(values[mesh.cells[cells, 0]])
+            at = mesh.cells[cells, 0]
+            between = (
+                values[at] if less is None or less.values is None else subject.between(values[at], less.values[at])
+            )
             axes.add_collection(
                 LineCollection(list(segments), colors="black", linewidths=3.2, capstyle="round"), autolim=False
             )
             axes.add_collection(
-                LineCollection(list(segments), colors=shown, linewidths=2.4, capstyle="round"), autolim=False
+                LineCollection(list(segments), colors=scale.rgba(between), linewidths=2.4, capstyle="round"),
+                autolim=False,
             )
         else:
             cased(axes, segments, 0.5)
@@ -146,13 +155,6 @@ def _letters(axes: Any, axis: int) -> None:
         align = {"ha": "right" if x < 0 else "left" if x > 1 else "center"}
         align["va"] = "top" if y < 0 else "bottom" if y > 1 else "center"
         axes.text(x, y, letter, transform=axes.transAxes, color=FAINT, fontsize="small", **align)
-
-
-def _differences(subject: Subject) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """How the two maps differ: on the grid, and at the vertices; None where there are none."""
-    first, last = subject.maps[0], subject.maps[-1]
-    on_grid = None if first.volume is None else subject.between(first.volume, last.volume)
-    return on_grid, None if first.values is None else subject.between(first.values, last.values)
 
 
 def _where_to_cut(subject: Subject, grid: Grid) -> dict[int, int]:
