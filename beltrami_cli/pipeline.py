@@ -232,8 +232,10 @@ def _subject(job: Job, scene: Scene, mesh: Mesh | None, maps: tuple[Map, ...], r
         compares=True,
         difference="removed",
         record=record,
+        has_anatomy=formats.volume_format(job.data) not in ("NPY", "PNG") if maps[0].volume is not None else True,
+        rows_down=maps[0].volume is not None and formats.volume_format(job.data) == "PNG",
         notes=tuple(notes),
-    )
+    ).in_one_range()
 
 
 def map_of(job: Job) -> str | int | None:

@@ -18,6 +18,7 @@ from beltrami_cli.progress import Phases
 from beltrami_cli.report.colours import require_map
 from beltrami_cli.report.geometry import SIDES
 from beltrami_cli.report.subject import Map, Subject
+from beltrami_cli.solver import Solver
 from beltrami_cli.surface import Mesh
 from beltrami_cli.survey import REMEDY, Scene, survey
 
@@ -139,7 +140,8 @@ def _maps(view: View, warnings: Warnings) -> Subject:
     maps = []
     for job, title in zip(jobs, view.names, strict=True):
         values = formats.read_overlay(job.data, len(surface.vertices_ras_mm), channels=True, map=map_of(job))
-        maps.append(Map(title, without(values, view.missing)))
+        which = "" if view.map is None or view.titles else f": {view.map}"
+        maps.append(Map(title + which, without(values, view.missing)))
     _require_as_many([each.values for each in maps if each.values is not None], axes=1)
     return _subject(view, maps, replace(surface, structure=scenes[0].structure_of(surface)))
 
@@ -158,18 +160,31 @@ def _volumes(view: View, jobs: Sequence[tuple[Job, Scene]], warnings: Warnings) 
     maps = []
     for title, data in zip(view.names, given, strict=True):
         shown = axes.forth(parts(without(data.data, view.missing)))
-        maps.append(Map(title, solver.at_mesh(data.data), shown))
+        maps.append(Map(title, _at_mesh(solver, data.data), shown))
     mesh = None if first.levelset is None else solver.shown[0][0]
-    return replace(_subject(view, maps, mesh), grid=axes.grid)
+    form = formats.volume_format(first.data)
+    return replace(
+        _subject(view, maps, mesh), grid=axes.grid, has_anatomy=form not in ("NPY", "PNG"), rows_down=form == "PNG"
+    )
+
+
+def _at_mesh(solver: Solver, data: np.ndarray) -> np.ndarray | None:
+    """Values of a volume at the vertices, of several channels each on its own: what one lacks the others may have."""
+    if not solver.settings.independent or solver.settings.flat:
+        return solver.at_mesh(data)
+    frames = [solver.at_mesh(data[..., k]) for k in range(data.shape[-1])]
+    return np.stack([frame for frame in frames if frame is not None], -1)
 
 
 def _job(view: View, file: Path) -> Job:
     """What denoise would be asked, so that the same files are read in the same way."""
-    several = not formats.is_overlay(file) and _is_vector(view, file)
+    count, is_complex = (1, False) if formats.is_overlay(file) else _layout(view, file)
+    several = count > 1 or is_complex
     settings = Settings(
         flat=view.levelset is None,
         kind="circular" if view.period else "vector" if several else "scalar",
         period=view.period,
+        independent=several and not is_complex,
         missing=view.missing,
         inside=view.inside,
         beta=Beta((0.0,)),
@@ -178,13 +193,11 @@ def _job(view: View, file: Path) -> Job:
     return Job(data=file, volume=_NOWHERE, mesh=(), settings=settings, **{name: getattr(view, name) for name in same})
 
 
-def _is_vector(view: View, file: Path) -> bool:
-    """True for a volume of complex numbers, or of several channels or frames."""
+def _layout(view: View, file: Path) -> tuple[int, bool]:
+    """How many channels or frames a volume has, and whether they are complex; of angles it is to have one."""
     if view.period is not None or formats.is_surface(file):
-        return False
-    plane = view.levelset is None or _is_plane(view.levelset)
-    count, is_complex = formats.read_layout(file, plane=plane)
-    return count > 1 or is_complex
+        return 1, False
+    return formats.read_layout(file, plane=view.levelset is None or _is_plane(view.levelset))
 
 
 def _is_plane(levelset: Path) -> bool:
@@ -215,4 +228,4 @@ def _subject(view: View, maps: Sequence[Map], mesh: Mesh | None) -> Subject:
         difference=" − ".join(view.names) if view.compare else "",
         side=view.side,
         colours=view.colours,
-    )
+    ).in_one_range()

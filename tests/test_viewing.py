@@ -168,3 +168,48 @@ def test_vertices_in_a_tight_sulcus_are_no_specks(tmp_path, shown):
     values = shown[0].maps[0].values
     assert np.isfinite(values).mean() > 0.98
     assert set(np.round(values[np.isfinite(values)])) == {0.0, 100.0}
+
+
+def test_frames_lack_values_each_on_its_own(files, shown, tmp_path):
+    frames = np.stack([noisy(), noisy(seed=1)], -1)
+    frames[:8, ..., 0] = np.nan
+    series = nifti(tmp_path / "series.nii.gz", frames)
+    done("view", series, "--levelset", files["psi"], "-o", files["out"])
+    values = shown[0].maps[0].values
+    left = shown[0].mesh.vertices_ras_mm[:, 0] < 6
+    assert np.isnan(values[left, 0]).all()
+    assert np.isfinite(values[:, 1]).all()
+
+
+def test_equal_angles_of_two_files_are_equal_numbers(files, shown, tmp_path):
+    angle = noisy(mean=0, sigma=60) % 360
+    signed = (angle + 180) % 360 - 180
+    a, b = (nifti(tmp_path / f"{name}.nii.gz", v) for name, v in (("turn", angle), ("half", signed)))
+    done("view", "--compare", a, b, "--levelset", files["psi"], "--period", "360", "-o", files["out"])
+    first, second = shown[0].maps
+    assert shown[0].low == -180
+    assert np.allclose(first.volume, second.volume, atol=1e-3)
+    assert np.abs(shown[0].differences()).max() < 1e-3
+
+
+def test_the_map_that_is_shown_is_named(files, shown, tmp_path):
+    done("denoise", files["mesh"], files["metric"], "-o", tmp_path / "o.func.gii", "--iterations", "1", "--no-mesh")
+    common = ("--levelset", files["mesh"], "-o", files["out"], "--overwrite")
+    done("view", tmp_path / "o.func.gii", *common, "--map", "1")
+    done("view", tmp_path / "o.func.gii", *common, "--map", "1", "--titles", "mine")
+    assert [subject.maps[0].title for subject in shown] == ["o.func: 1", "mine"]
+
+
+def test_a_picture_is_known_to_be_no_head(files, shown, tmp_path):
+    from PIL import Image
+
+    Image.fromarray((noisy((20, 30)) * 2).clip(0, 255).astype(np.uint8)).save(tmp_path / "photo.png")
+    done("view", tmp_path / "photo.png", "-o", files["out"])
+    plane = npy(tmp_path / "plane.npy", noisy((20, 30)))
+    done("view", plane, "-o", files["out"], "--overwrite")
+    done("view", files["a"], "-o", files["out"], "--overwrite")
+    assert [(subject.has_anatomy, subject.rows_down) for subject in shown] == [
+        (False, True),
+        (False, False),
+        (True, False),
+    ]

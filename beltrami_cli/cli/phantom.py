@@ -68,4 +68,6 @@ def phantom(
             formats.write_volume(stage.path(path), volume)
         stage.commit()
     say(quiet, f"wrote {', '.join(map(str, volumes))}")
+    if name == "cortex" or painting == "angle":
+        say(quiet, "the values are angles: --kind circular --period 360 of denoise, --period 360 of view and compare")
     return 0

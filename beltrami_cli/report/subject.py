@@ -26,6 +26,9 @@ class Map:
     volume: np.ndarray | None = None
     filled: np.ndarray | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "title", _printable(self.title))
+
 
 @dataclass(frozen=True, eq=False)
 class Subject:
@@ -37,7 +40,9 @@ class Subject:
     period: of angles, which lie in [low, low + period); None for other data. compares: the first of two maps less the
     second is shown too, under the name `difference`. record: the sidecar of the run that led from one to the other.
     side: from where a surface is seen first, a name in `geometry.SIDES`, None for where most of the data are seen.
-    colours: the name of a colour map in place of the default. notes: lines on what is shown.
+    colours: the name of a colour map in place of the default. has_anatomy: the grid's axes are known to be those of a
+    head; rows_down: of a plane, the first axis runs down and the second to the right, as in pictures. notes: lines on
+    what is shown.
     """
 
     title: str
@@ -51,7 +56,13 @@ class Subject:
     record: Mapping[str, Any] | None = None
     side: str | None = None
     colours: str | None = None
+    has_anatomy: bool = True
+    rows_down: bool = False
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "title", _printable(self.title))
+        object.__setattr__(self, "notes", tuple(map(_printable, self.notes)))
 
     @property
     def is_curve(self) -> bool:
@@ -96,3 +107,20 @@ class Subject:
         if self.period is not None:
             difference = (difference + self.period / 2) % self.period - self.period / 2
         return difference
+
+    def in_one_range(self) -> Subject:
+        """The same with all angles in [low, low + period), so that equal ones are equal numbers."""
+        if self.period is None:
+            return self
+        low, period = self.low, self.period
+
+        def wrapped(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else low + (values - low) % period
+
+        maps = (replace(each, values=wrapped(each.values), volume=wrapped(each.volume)) for each in self.maps)
+        return replace(self, maps=tuple(maps))
+
+
+def _printable(text: str) -> str:
+    """A title with what is no text spelt out, as names of files may have it."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
