@@ -437,7 +437,7 @@ def write_summary(path: Path, rows: Sequence[Row], study: Sequence[Planned] = ()
     """
     kind = _summary_format(path)
     _make_folder(path.parent)
-    with formats.Stage([path], overwrite=True) as stage, formats.writing(path):
+    with formats.Stage([path], overwrite=True) as stage:
         if kind == "html":
             from beltrami_cli.report import index
 
@@ -445,7 +445,8 @@ def write_summary(path: Path, rows: Sequence[Row], study: Sequence[Planned] = ()
             index.write(stage.path(path), [asdict(row) for row in rows], pages, folder=path.absolute().parent)
         else:
             text = _as_csv(rows) if kind == "csv" else _as_json(rows)
-            stage.path(path).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
+            with formats.writing(path):
+                stage.path(path).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
         stage.commit()
 
 

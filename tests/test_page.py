@@ -106,6 +106,21 @@ def test_a_page_names_nothing_outside_itself(name, tmp_path):
     assert "img" in read.tags
 
 
+def test_letters_of_drawings_stay_readable_on_a_telephone():
+    least = int(
+        re.search(r"\.picture img \{[^}]*min-width: (\d+)px", Path(page.__file__).with_name("page.css").read_text())[1]
+    )
+    for subject in (circle(), flat(), three_channels()):
+        for address in Read(page.page(subject)).addresses:
+            if not address.startswith("data:image/svg"):
+                continue
+            svg = base64.b64decode(address.partition(",")[2]).decode()
+            points = float(re.search(r'width="([\d.]+)pt"', svg)[1])
+            sizes = [100 * float(each) for each in re.findall(r"scale\(([\d.]+) -[\d.]+\)", svg)]
+            assert len(sizes) > 5
+            assert min(sizes) * least / points >= 11
+
+
 def test_names_are_text_and_never_markup(tmp_path):
     subject = angles(sphere(1), title=NASTY)
     maps = tuple(replace(each, title=NASTY) for each in subject.maps)
@@ -121,6 +136,61 @@ def test_a_name_that_is_no_text_is_spelt_out(tmp_path):
     file = tmp_path / "page.html"
     page.write(file, replace(flat(), title="caf\udce9"))
     assert "caf\\udce9" in file.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("titles", "named"), [(("noisy", "denoised"), "noisy, denoised"), (("", ""), "Maps")])
+def test_a_page_without_a_title_has_no_empty_heading(titles, named, monkeypatch):
+    monkeypatch.setattr(page, "_pictures", lambda *_: [])
+    maps = tuple(replace(each, title=title) for each, title in zip(flat().maps, titles, strict=True))
+    text = page.page(replace(flat(), title="", maps=maps))
+    assert "<h1" not in text
+    assert f"<title>{named}</title>" in text
+
+
+@pytest.mark.parametrize(("period", "of"), [(360.0, "°"), (2 * np.pi, " rad"), (24.0, ""), (None, "")])
+def test_angles_have_their_unit(period, of):
+    said = dict(page.facts(RECORD, period))
+    assert said["Noise"] == f"39.9{of} → 0.593{of}"
+    assert said["Removed (rms)"] == f"40.5{of}"
+    assert said["Smoothness (FWHM)"] == "1.02 → 11.8 mm"
+
+
+def test_the_time_leaves_out_the_picture():
+    assert dict(page.facts({"Seconds": {"read": 0.25, "flow": 3.75, "report": 9.0}}))["Denoised in"] == "4.0 s"
+    assert "Denoised in" not in dict(page.facts({"Seconds": {}}))
+
+
+def test_a_flow_without_iterations_is_explained():
+    note = "The flow changed nothing"
+    assert note not in page.page(circle())
+    none = replace(circle(), record={**RECORD, "Iterations": 0})
+    assert f"{note}: what was removed is the extension to the surface alone." in page.page(none)
+    at_vertices = tuple(replace(each, volume=None) for each in none.maps)
+    assert f"{note}." in page.page(replace(none, maps=at_vertices, grid=None))
+
+
+def test_parameters_that_are_not_set_take_one_line():
+    record = {"Parameters": {"phi": None, "beta": 0.5, "edge": None, "seed": 0}}
+    (table,) = page.tables(record)
+    assert table.rows == [("beta", "0.5"), ("seed", "0"), ("not set", "phi, edge")]
+
+
+def test_a_beta_that_was_chosen_is_said():
+    record = {"Parameters": {"flow": "beltrami", "beta": "auto"}, "Choice": {"beta": 0.03333}}
+    assert dict(page.facts(record))["Flow"] == "beltrami, beta 0.0333"
+    assert next(page.tables(record)).rows[1] == ("beta", "0.03333 (auto)")
+    unknown = {"Parameters": {"flow": "beltrami", "beta": "auto"}, "Choice": {"beta": None}}
+    assert dict(page.facts(unknown))["Flow"] == "beltrami, beta auto"
+
+
+def test_a_surface_without_any_value_says_so():
+    one = angles(sphere(1))
+    maps = tuple(replace(each, values=np.full_like(each.values, np.nan), filled=None) for each in one.maps)
+    text = page.page(replace(one, maps=maps))
+    assert "No values." in text
+    assert scene_of(text)["scales"] == [None]
+    assert "Histograms" not in Read(text).words
+    assert "No values." not in page.page(one)
 
 
 def test_what_was_done_and_every_parameter_are_said():
@@ -167,6 +237,8 @@ def test_the_scene_holds_the_surface_and_its_values():
     assert np.array_equal(unpacked(scene["maps"][1]["filled"], "u1"), subject.maps[1].filled)
     assert scene["scales"] == [{"low": 0.0, "high": 360.0, "cyclic": True}]
     assert len(scene["views"]) == 4
+    assert scene["best"]["name"] == "facing the data"
+    assert scene["unit"] == "°"
 
 
 def test_outlines_stand_a_little_off_the_surface():
@@ -189,7 +261,7 @@ def test_a_quarter_of_a_million_triangles_stay_below_15_megabytes(tmp_path):
     triangles = unpacked(scene["triangles"], "<u4").reshape(-1, 3)
     assert 0.95 * page.TRIANGLES < len(triangles) <= page.TRIANGLES
     assert f"shown with {len(triangles):,} of 327,680 triangles" in text
-    assert [form["name"] for form in scene["forms"]] == ["folded", "inflated"]
+    assert [form["name"] for form in scene["forms"]] == ["inflated", "folded"]
     known = np.isfinite(unpacked(scene["maps"][0]["values"][0], "<f4")).mean()
     assert known == pytest.approx(0.8, abs=0.02)
 
@@ -204,6 +276,15 @@ def test_many_channels_and_maps_are_cut_short_and_it_is_said(monkeypatch):
 
 def test_the_same_subject_makes_the_same_page():
     assert page.page(circle()) == page.page(circle())
+
+
+def test_a_bug_in_a_drawing_is_not_told_as_a_full_disk(monkeypatch, tmp_path):
+    def broken(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(page, "_pictures", broken)
+    with pytest.raises(ZeroDivisionError):
+        page.write(tmp_path / "page.html", flat())
 
 
 def test_a_folder_that_is_not_there_is_told_in_a_line(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def cortex_file(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def opened(chromium, cortex_file):
-    return open_page(chromium, cortex_file)
+    return open_page(chromium, cortex_file, height=640)
 
 
 @pytest.fixture
@@ -55,6 +56,18 @@ def settle(window) -> None:
 def scenes(window) -> list[np.ndarray]:
     """What each scene shows, those that are hidden left out, in the order of the document."""
     return [pixels(each.screenshot()) for each in window.locator(".plot").all() if each.is_visible()]
+
+
+def first(window) -> np.ndarray:
+    """What the first scene shows."""
+    return pixels(window.locator(".plot").first.screenshot())
+
+
+def letters(window) -> str:
+    """At the left, right, bottom and top of every pane, which must agree."""
+    panes = {" ".join(pane.locator(".letter").all_inner_texts()) for pane in window.locator(".pane").all()}
+    assert len(panes) == 1
+    return panes.pop()
 
 
 def cameras(window) -> list[dict]:
@@ -122,6 +135,7 @@ def test_a_drag_in_one_scene_turns_all_while_it_goes_on(window):
     assert np.linalg.norm(midway - start, axis=1).min() > 0.3
     assert np.ptp(midway, axis=0).max() < 1e-6
     assert np.ptp(end, axis=0).max() < 1e-6
+    assert window.locator("#view").inner_text() == "Seen: turned"
     assert all(changed(one, other) > 0.03 for one, other in zip(before, after, strict=True))
 
 
@@ -135,41 +149,65 @@ def test_the_wheel_brings_all_nearer(window):
     assert end / start == pytest.approx(np.exp(-0.15), abs=1e-3)
 
 
-def test_keys_1_to_4_look_from_four_sides(window):
-    towards = []
+def test_keys_1_to_4_look_from_four_sides_and_name_them(window):
+    assert window.locator("#view").inner_text() == "Seen: facing the data"
+    assert window.locator('button[aria-current="true"]').count() == 0
+    towards, seen = [], []
     for key in "1234":
         window.keyboard.press(key)
         settle(window)
+        current = window.locator('button[aria-current="true"]').get_attribute("data-key")
+        seen.append((current, window.locator("#view").inner_text().removeprefix("Seen: "), letters(window)))
         at = eyes(window)
         assert np.ptp(at, axis=0).max() < 1e-3
         towards.append(at[0] / np.linalg.norm(at[0]))
     assert np.round(towards, 3).tolist() == [[-1, 0, 0], [1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    assert seen == [
+        ("1", "lateral", "A P I S"),
+        ("2", "medial", "P A I S"),
+        ("3", "dorsal", "L R P A"),
+        ("4", "posterior", "L R I S"),
+    ]
 
 
 def test_arrows_turn_a_scene_that_has_the_focus_and_all_others(window):
-    window.keyboard.press("1")
+    window.keyboard.press("1")  # from the left
     settle(window)
+    start = eyes(window)[0]
     window.locator(".pane").first.focus()
-    window.keyboard.press("ArrowRight")
+    for key, towards in (("ArrowRight", (0, -1)), ("ArrowLeft", (0, 1)), ("ArrowUp", (1, 0)), ("ArrowDown", (-1, 0))):
+        window.keyboard.press(key)
+        settle(window)
+        at = eyes(window)
+        assert np.ptp(at, axis=0).max() < 1e-3
+        if key in ("ArrowRight", "ArrowUp"):
+            up, across = (np.array(towards) * np.sin(np.radians(10))).tolist()
+            assert at[0] / np.linalg.norm(at[0]) == pytest.approx([-np.cos(np.radians(10)), across, up], abs=1e-3)
+        else:  # back again
+            assert at[0] == pytest.approx(start, abs=1e-3)
+    assert letters(window) == "A P I S"
+    for _ in range(4):
+        window.keyboard.press("ArrowUp")
+    assert letters(window) == "A P IL SR"
+    window.keyboard.press("+")
     settle(window)
-    at = eyes(window)
-    assert np.ptp(at, axis=0).max() < 1e-3
-    assert np.degrees(np.arccos(-at[0, 0] / np.linalg.norm(at[0]))) == pytest.approx(10, abs=0.01)
+    assert np.linalg.norm(eyes(window)[0]) / np.linalg.norm(start) == pytest.approx(0.9, abs=1e-3)
+    assert window.locator("#view").inner_text() == "Seen: turned"
 
 
-@pytest.mark.parametrize("key", ["f", "m"])
-def test_outlines_and_missing_parts_are_toggled(window, key):
+def test_outlines_and_missing_parts_are_toggled(window):
     window.keyboard.press("2")
     settle(window)
-    before = scenes(window)
-    window.keyboard.press(key)
-    settle(window)
-    assert pressed(window, key) == "false"
-    assert changed(before[0], scenes(window)[0]) > 0.0005
-    window.keyboard.press(key)
-    settle(window)
-    assert pressed(window, key) == "true"
-    assert changed(before[0], scenes(window)[0]) < 0.0002
+    before = first(window)
+    for key in "fm":
+        window.keyboard.press(key)
+        settle(window)
+        assert pressed(window, key) == "false"
+        assert changed(before, first(window)) > 0.0005
+        window.keyboard.press(key)
+        settle(window)
+        assert pressed(window, key) == "true"
+    assert changed(before, first(window)) < 0.0002
 
 
 def test_the_inflated_copy_is_hidden_and_comes_back_in_step(window):
@@ -223,14 +261,29 @@ def test_the_value_under_the_pointer_is_told(window):
     window.wait_for_selector("#tip:visible", timeout=3000)
     said = window.locator("#tip").inner_text().split("\n")
     assert said[0].startswith("before")
-    assert float(said[1].removeprefix("after")) == pytest.approx(180, abs=15)
+    assert said[1].endswith("°")
+    assert float(said[1].removeprefix("after").removesuffix("°")) == pytest.approx(180, abs=15)
+
+
+def test_the_key_has_units_and_says_what_is_there(window):
+    said = window.locator("#key").inner_text().split("\n")
+    assert {"0°", "90°", "180°", "270°", "missing", "filled in: paler, outlined"} <= set(said)
 
 
 def test_channels_change_surface_and_drawings(chromium, tmp_path):
-    page.write(tmp_path / "channels.html", three_channels())
-    window, log = open_page(chromium, tmp_path / "channels.html")
+    subject = three_channels()
+    for shown in subject.maps:
+        assert shown.values is not None
+        shown.values[:, 2] = np.nan
+    before, after = subject.maps
+    everywhere = np.ones(len(after.values), bool)  # which has no border to draw
+    subject = replace(subject, maps=(before, replace(after, filled=everywhere)))
+    page.write(tmp_path / "channels.html", subject)
+    window, log = open_page(chromium, tmp_path / "channels.html", height=640)
     assert len(scenes(window)) == 2
     ticks = window.locator("#key").inner_text()
+    assert ticks.split("\n")[-2:] == ["missing", "filled in: paler"]
+    assert not window.locator('button[data-key="f"]').is_visible()
     window.keyboard.press("c")
     settle(window)
     assert window.locator("#channel").input_value() == "1"
@@ -240,13 +293,22 @@ def test_channels_change_surface_and_drawings(chromium, tmp_path):
     window.keyboard.press("ArrowDown")
     settle(window)
     assert window.locator("#channel").input_value() == "2"
+    # Of a channel without a value there is nothing that colours could mean.
+    assert window.locator("#key").inner_text() == "missing"
+    assert window.locator("section.picture[data-channel]:visible").count() == 0
+    window.keyboard.press("c")
+    settle(window)
+    assert window.locator("#key").inner_text() == ticks
     assert log.errors == []
 
 
-def test_a_curve_needs_no_script(chromium, tmp_path):
+def test_a_curve_needs_no_script_and_a_telephone_scrolls_its_drawings(chromium, tmp_path):
     page.write(tmp_path / "curve.html", circle())
-    window, log = open_page(chromium, tmp_path / "curve.html", width=800)
+    window, log = open_page(chromium, tmp_path / "curve.html", width=420)
     assert log.errors == []
+    assert window.locator("img").evaluate_all("images => images.every(each => each.width >= 840)")
+    boxes = window.locator(".picture .scroll")
+    assert boxes.evaluate_all("boxes => boxes.every(each => each.clientWidth < 420 && each.scrollWidth >= 840)")
     assert window.locator("img").evaluate_all("images => images.every(each => each.naturalWidth > 300 && each.alt)")
     assert window.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
 

@@ -63,9 +63,7 @@ def _line(folder: Path, row: Mapping[str, Any], report: Path | None) -> Line:
     return Line(
         name=str(row.get("job") or ""),
         status=str(row.get("status") or ""),
-        figures=[
-            _cell(row.get(key)) for key in ("noise_before", "noise_after", "iterations", "stop_reason", "seconds")
-        ],
+        figures=[_cell(row.get(key)) for key in FIGURES],
         warnings=[str(line) for line in row.get("warnings") or ()],
         reason=str(row.get("reason") or ""),
         report=link,

@@ -64,7 +64,7 @@ function drawSurface(scene) {
     filled: map.filled && new Uint8Array(bytes(map.filled)),
   }));
   const forms = scene.forms.map((form) => ({ name: form.name, ...placed(form), borders: borderLines(form) }));
-  const best = facing(scene.best);
+  const best = facing(scene.best.camera);
   const shown = { i: true, f: true, m: true };
   const panes = [];
   let camera = best();
@@ -88,16 +88,18 @@ function drawSurface(scene) {
   // A camera from a side, as near as every surface fits into its pane; made when asked, because panes change in size.
   function facing([right, up, towards]) {
     return () => {
-      const wide = panes.length ? Math.min(...panes.map((pane) => pane.plot.clientWidth / pane.plot.clientHeight || 1)) : 1;
+      // Letters at the sides take room.
+      const [wide, tall] = panes.map(({ plot }) => [(plot.clientWidth - 60) / plot.clientHeight, 1 - 44 / plot.clientHeight])
+        .find(([share]) => share > 0) || [1, 1];
       let distance = 0;
       for (const form of forms) {
         for (let v = 0; v < form.x.length; v++) {
           const along = (way) => way[0] * form.x[v] + way[1] * form.y[v] + way[2] * form.z[v];
-          const reach = Math.max(Math.abs(along(up)), Math.abs(along(right)) / wide) / HALF_ANGLE;
+          const reach = Math.max(Math.abs(along(up)) / tall, Math.abs(along(right)) / wide) / HALF_ANGLE;
           distance = Math.max(distance, along(towards) + reach);
         }
       }
-      return { eye: towards.map((part) => part * distance * 1.04), up, centre: [0, 0, 0] };
+      return { eye: towards.map((part) => part * distance), up, centre: [0, 0, 0] };
     };
   }
 
@@ -107,11 +109,11 @@ function drawSurface(scene) {
     return { eye: point(at), up: point(up), center: point(centre), projection: { type: "perspective" } };
   }
 
+  const pale = colours.map((colour) => colour.map((part, c) => scene.fading * scene.greys[0][c] + (1 - scene.fading) * part));
+
   // One colour per vertex: a scale that wraps must not be interpolated as a number.
   function vertexColours(map) {
-    const { low, high, cyclic } = scene.scales[channel];
-    const faded = (colour) => colour.map((part, c) => scene.fading * scene.greys[0][c] + (1 - scene.fading) * part);
-    const pale = colours.map(faded);
+    const { low, high, cyclic } = scene.scales[channel] || { low: 0, high: 1 }; // without one there is no value
     return Array.from(map.values[channel], (value, v) => {
       let share = (value - low) / (high - low);
       share = cyclic ? share - Math.floor(share) : Math.min(Math.max(share, 0), 1);
@@ -173,9 +175,17 @@ function drawSurface(scene) {
         const caption = figure.appendChild(document.createElement("figcaption"));
         caption.textContent = map.title;
         if (forms.length > 1) caption.appendChild(document.createElement("span")).textContent = ` ${form.name}`;
-        const plot = figure.appendChild(document.createElement("div"));
+        const stage = figure.appendChild(document.createElement("div"));
+        stage.className = "stage";
+        const plot = stage.appendChild(document.createElement("div"));
         plot.className = "plot";
-        panes.push({ form, map, m, row, figure, plot });
+        const letters = ["left", "right", "bottom", "top"].map((side) => {
+          const letter = stage.appendChild(document.createElement("span"));
+          letter.className = `letter ${side}`;
+          letter.setAttribute("aria-hidden", "true");
+          return letter;
+        });
+        panes.push({ form, map, m, row, figure, plot, letters });
       }
     }
   }
@@ -188,8 +198,11 @@ function drawSurface(scene) {
   const sum = (a, b, share) => a.map((part, k) => part + share * b[k]);
   let isWaiting = false;
 
-  function look(next) {
+  // view: the name of the side from which the camera looks.
+  function look(next, view = null) {
     camera = next;
+    if (view !== null) tellView(view);
+    letter();
     byId("tip").hidden = true;
     if (isWaiting) return;
     isWaiting = true;
@@ -197,6 +210,20 @@ function drawSurface(scene) {
       isWaiting = false;
       for (const pane of panes) if (!pane.row.hidden) Plotly.relayout(pane.plot, { "scene.camera": forPlotly(camera) });
     });
+  }
+
+  function tellView(name) {
+    byId("view").textContent = `Seen: ${name}`;
+    for (const [k, view] of scene.views.entries()) toggle(k + 1).setAttribute("aria-current", view.name === name);
+  }
+
+  // Where left, right, posterior, anterior, inferior and superior are: of an oblique side its main parts, the first most.
+  function letter() {
+    const { right, up } = sides();
+    const names = [right.map((part) => -part), right, up.map((part) => -part), up].map((way) =>
+      [0, 1, 2].filter((axis) => Math.abs(way[axis]) > 0.4).sort((a, b) => Math.abs(way[b]) - Math.abs(way[a]))
+        .map((axis) => ["LR", "PA", "IS"][axis][way[axis] > 0 ? 1 : 0]).join(""));
+    for (const pane of panes) for (const [k, name] of names.entries()) pane.letters[k].textContent = name;
   }
 
   function sides() {
@@ -211,7 +238,7 @@ function drawSurface(scene) {
     const size = Math.hypot(...camera.eye);
     const aside = sum(towards.map((part) => part * Math.cos(across)), right, Math.sin(across));
     const eye = sum(aside.map((part) => part * Math.cos(upwards)), up, Math.sin(upwards));
-    look({ ...camera, eye: eye.map((part) => part * size), up: sum(up.map((part) => part * Math.cos(upwards)), aside, -Math.sin(upwards)) });
+    look({ ...camera, eye: eye.map((part) => part * size), up: sum(up.map((part) => part * Math.cos(upwards)), aside, -Math.sin(upwards)) }, "turned");
   }
 
   // By shares of the pane's height.
@@ -316,11 +343,11 @@ function drawSurface(scene) {
   function told(map, vertex) {
     const value = map.values[channel][vertex];
     if (!Number.isFinite(value)) return "missing";
-    return figure(value) + (map.filled && map.filled[vertex] ? " (filled)" : "");
+    return figure(value) + scene.unit + (map.filled && map.filled[vertex] ? " (filled)" : "");
   }
 
-  function figure(value) {
-    return String(Number(value.toPrecision(4))).replace("-", "−");
+  function figure(value, digits = 4) {
+    return String(Number(value.toPrecision(digits))).replace("-", "−");
   }
 
   // What the colours mean.
@@ -334,7 +361,6 @@ function drawSurface(scene) {
   }
 
   function showKey() {
-    const { low, high, cyclic } = scene.scales[channel];
     const part = (name, parent, text = "") => {
       const made = parent.appendChild(document.createElement(name === "b" ? "b" : "div"));
       if (name !== "b") made.className = name;
@@ -343,6 +369,26 @@ function drawSurface(scene) {
     };
     const box = byId("key");
     box.replaceChildren();
+    if (scene.scales[channel]) showScale(part, box, scene.scales[channel]);
+    const has = (map, is) => map.values[channel].some((value, v) => is(Number.isFinite(value), map.filled && map.filled[v]));
+    const isOutlined = forms[0].borders.x.length > 0;
+    const isFilled = isOutlined || maps.some((map) => has(map, (isKnown, filled) => isKnown && filled));
+    const isMissing = maps.some((map) => has(map, (isKnown) => !isKnown));
+    const legend = (text, looks) => {
+      const line = part("legend", box);
+      const swatch = line.appendChild(document.createElement("span"));
+      swatch.className = "swatch";
+      Object.assign(swatch.style, looks);
+      line.append(text);
+    };
+    if (isMissing) legend("missing", { background: rgb(scene.greys[0]) });
+    if (isFilled) legend(isOutlined ? "filled in: paler, outlined" : "filled in: paler", { background: `linear-gradient(to right, ${[0, 64, 128, 192, 255].map((k) => rgb(pale[k])).join(", ")})`, border: isOutlined ? `3px solid ${scene.outline}` : "" });
+    for (const [key, there] of [["f", isOutlined], ["m", isMissing && Boolean(scene.scales[channel])]]) toggle(key).hidden = !there;
+  }
+
+  const rgb = (colour) => `rgb(${colour.map((part) => 255 * part).join(" ")})`;
+
+  function showScale(part, box, { low, high, cyclic }) {
     const steps = Array.from({ length: 33 }, (_, k) => css(Math.min(8 * k, 255)));
     if (cyclic) {
       const wheel = part("wheel", box);
@@ -352,14 +398,13 @@ function drawSurface(scene) {
       part("hole", wheel);
       for (let quarter = 0; quarter < 4; quarter++) {
         const value = (quarter * period) / 4;
-        const label = part("b", wheel, figure(value < high ? value : value - period));
-        label.style.left = `${100 + 74 * [1, 0, -1, 0][quarter]}px`;
-        label.style.top = `${85 - 63 * [0, 1, 0, -1][quarter]}px`;
+        const label = part("b", wheel, figure(value < high ? value : value - period, 3) + scene.unit);
+        label.className = ["right", "top", "left", "bottom"][quarter];
       }
       // Polar angles of the visual field, where 90 is up.
       for (const [x, y, words] of !scene.isVisualField ? [] : [[1, 1, "upper right"], [-1, 1, "upper left"], [-1, -1, "lower left"], [1, -1, "lower right"]]) {
         const label = part("quadrant", wheel, words);
-        label.style.left = `${100 + 70 * x}px`;
+        label.style.left = `${125 + 70 * x}px`;
         label.style.top = `${85 - 58 * y}px`;
       }
     } else {
@@ -369,17 +414,6 @@ function drawSurface(scene) {
         part("b", bar, figure(value)).style.bottom = `${(100 * (value - low)) / (high - low)}%`;
       }
     }
-    const is = { missing: maps.some((map) => map.values[channel].some(Number.isNaN)), filled: forms[0].borders.x.length > 0 };
-    for (const [kind, text] of [["missing", "missing"], ["filled", "filled in: paler, outlined"]]) {
-      if (!is[kind]) continue;
-      const line = part("legend", box);
-      const swatch = line.appendChild(document.createElement("span"));
-      swatch.className = `swatch ${kind}`;
-      if (kind === "filled") swatch.style.borderColor = scene.outline;
-      else swatch.style.background = `rgb(${scene.greys[0].map((part) => 255 * part).join(" ")})`;
-      line.append(text);
-    }
-    for (const [key, there] of [["f", is.filled], ["m", is.missing]]) toggle(key).hidden = !there;
   }
 
   // Buttons and keys.
@@ -419,7 +453,7 @@ function drawSurface(scene) {
     }
     for (const [k, view] of scene.views.entries()) {
       const from = facing(view.camera);
-      actions[k + 1] = () => { look(from()); say(`View: ${view.name}`); };
+      actions[k + 1] = () => { look(from(), view.name); say(`View: ${view.name}`); };
     }
     if (maps.length > 1) actions.b = () => { swap(turn + 1); say(`First: ${maps[turn].title}`); };
     actions["?"] = () => byId("help").showModal();
@@ -427,13 +461,15 @@ function drawSurface(scene) {
       for (const key of Object.keys(names)) if (toggle(key)) setShown(key, true);
       swap(0);
       if (channelSelect && channel !== 0) showChannel(0);
-      look(best());
+      look(best(), scene.best.name);
       say("Reset");
     };
   }
 
   makePanes();
   camera = best();
+  tellView(scene.best.name);
+  letter();
   bind();
   showKey();
   onChannel = () => {

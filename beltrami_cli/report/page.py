@@ -31,9 +31,11 @@ CHANNELS = 6
 VALUE_BYTES = 5_000_000
 # Outlines stand off the surface by this share of its length, or the surface would hide half of them.
 STAND_OFF = 0.004
-# Drawings are as wide as the text, 1,150 pixels at most: of so many inches, letters of 8 points are 18 pixels high
-# there, and 12 in a window of 800.
+# Drawings are as wide as the text, 840 to 1,150 pixels: of so many inches, the smallest letters, of 6.7 points, are
+# at least 11 pixels high. Narrower windows scroll them.
 INCHES = 7.0
+COURSES = 3  # side by side in that width
+KEY = 1.4  # inches of it beside slices
 RASTER_DPI = 200
 
 
@@ -64,8 +66,9 @@ def write(path: Path, subject: Subject) -> None:
 
     Raises DataError where the file cannot be written.
     """
+    text = page(subject)
     with checks.writing(path):
-        path.write_text(page(subject), encoding="utf-8", errors="backslashreplace")
+        path.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def page(subject: Subject) -> str:
@@ -76,10 +79,16 @@ def page(subject: Subject) -> str:
     scene, notes = _scene(subject, channels) if has_scene else (None, [])
     if channels < subject.channels:
         notes.append(f"Shown: the first {channels} of {subject.channels:,} channels.")
+    if not any(_has_values(subject.channel(k)) for k in range(channels)):
+        notes.append("No values.")
+    if record.get("Iterations") == 0:
+        extended = "" if subject.maps[0].volume is None else ": what was removed is the extension to the surface alone"
+        notes.append(f"The flow changed nothing{extended}.")
     return fill(
         "page.html",
         title=subject.title,
-        facts=facts(record),
+        name=subject.title or ", ".join(shown.title for shown in subject.maps if shown.title) or "Maps",
+        facts=facts(record, subject.period),
         warnings=[str(line) for line in record.get("Warnings") or ()],
         notes=[*subject.notes, *notes],
         channels=channels,
@@ -143,11 +152,12 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
         if shown.filled is not None:
             filled |= shown.filled[source]
     is_cortex = geometry.is_cortex(whole)
-    forms = {"folded" if is_cortex else "surface": mesh}
-    if is_cortex:
-        forms["inflated"] = geometry.inflated(mesh)
-    scales = [colours.scale_of(subject.channel(k)) for k in range(channels)]
+    # The inflated one first: folds hide data in their sulci.
+    forms = {"inflated": geometry.inflated(mesh), "folded": mesh} if is_cortex else {"surface": mesh}
+    of_channels = [subject.channel(k) for k in range(channels)]
+    scales = [colours.scale_of(one) for one in of_channels]
     first = np.isfinite(_of_channel(maps[0].values, 0))
+    best = geometry.best_view(whole, first) if subject.side is None else geometry.from_side(whole, subject.side)
     scene = {
         "triangles": _packed(mesh.cells, np.uint32),
         "forms": [_form(name, form, filled) for name, form in forms.items()],
@@ -160,18 +170,28 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
             }
             for shown in maps
         ],
-        "scales": [{"low": scale.low, "high": scale.high, "cyclic": scale.period} for scale in scales],
+        "scales": [
+            {"low": scale.low, "high": scale.high, "cyclic": scale.period} if _has_values(one) else None
+            for scale, one in zip(scales, of_channels, strict=True)
+        ],
+        "unit": style.unit(subject.period),
         "isVisualField": subject.period == key.VISUAL_FIELD,
         "colours": _packed(scales[0].table(), np.uint8),
         "greys": [colours.MISSING, colours.MISSING_SULCUS],
         "fading": colours.FADING,
         "outline": colours.FILLED,
-        "views": [{"name": view.name, "camera": view.camera.tolist()} for view in geometry.views(whole)],
-        "best": (
-            geometry.best_view(whole, first) if subject.side is None else geometry.from_side(whole, subject.side)
-        ).camera.tolist(),
+        "views": [_view(view) for view in geometry.views(whole)],
+        "best": _view(best),
     }
     return scene, notes
+
+
+def _view(view: geometry.View) -> dict[str, Any]:
+    return {"name": view.name, "camera": view.camera.tolist()}
+
+
+def _has_values(subject: Subject) -> bool:
+    return any(bool(np.isfinite(colours.values_of(shown)).any()) for shown in subject.maps)
 
 
 def _of_channel(values: np.ndarray | None, k: int) -> np.ndarray:
@@ -222,6 +242,8 @@ def _pictures(subject: Subject, channels: int) -> Iterator[Picture]:
     titles = ", ".join(shown.title for shown in subject.maps)
     for k in range(channels):
         one = subject.channel(k)
+        if not _has_values(one):
+            continue
         of = k if channels > 1 else None
         scale = colours.scale_of(one)
         if subject.is_curve:
@@ -229,33 +251,39 @@ def _pictures(subject: Subject, channels: int) -> Iterator[Picture]:
             yield Picture("Along the curve", _drawn(graphs.curve, 3.0, one), alt, of)
         if one.maps[0].volume is not None:
             alt = f"Slices through the volumes with the surface's outline: {titles}."
-            is_plane = subject.grid is not None and 1 in subject.grid.shape
-            rows = 1 if is_plane else len(subject.maps) + subject.compares
-            yield Picture("Slices", _drawn(_slices, 1.75 * rows + 0.4, one, scale), alt, of)
+            yield Picture("Slices", _drawn(_slices, max(2.0, slices.height(one, INCHES - KEY)), one, scale), alt, of)
         what = f"How often each value occurs: {titles}" + (f"; and {subject.difference}." if subject.compares else ".")
         yield Picture("Histograms", _drawn(graphs.histograms, 2.2, one), what, of)
-    if graphs.has_iterations(subject.record):
+    if count := graphs.courses(subject.record):
         alt = "Over the iterations: change, and where known noise, beta and held-out error."
-        width = max(INCHES, 2.1 * graphs.courses(subject.record))
-        drawn = _drawn(graphs.iterations, 2.2, subject.record, subject.period, width=width)
+        rows = -(-count // COURSES)
+        drawn = _drawn(_courses, 2.2 * rows, subject.record, count, rows)
         yield Picture("Over the iterations", drawn, alt)
 
 
 def _slices(figure: Any, subject: Subject, scale: Scale) -> None:
     """Slices, and beside them what their colours mean."""
-    left, right = figure.subfigures(1, 2, width_ratios=[INCHES - 1.4, 1.4])
+    left, right = figure.subfigures(1, 2, width_ratios=[INCHES - KEY, KEY])
     slices.draw(left, subject, scale)
     key.draw(right, scale)
 
 
-def _drawn(draw: Callable[..., None], height: float, *what: Any, width: float = INCHES) -> str:
-    """A drawing as the address of an SVG; width and height in inches."""
+def _courses(figure: Any, record: Mapping[str, Any], count: int, rows: int) -> None:
+    """So many courses over the iterations in rows."""
+    axes = style.grid_of_axes(figure, rows, -(-count // rows), gap=(0.5, 0.75)).ravel()
+    graphs.draw_iterations(axes[:count], record)
+    for spare in axes[count:]:
+        spare.set_axis_off()
+
+
+def _drawn(draw: Callable[..., None], height: float, *what: Any) -> str:
+    """A drawing as the address of an SVG; height in inches."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     # A fixed salt and no date: the same subject makes the same bytes.
     with rc_context({**style.STYLE, "svg.fonttype": "path", "svg.hashsalt": "beltrami"}):
-        figure = Figure(figsize=(width, height), facecolor="white")
+        figure = Figure(figsize=(INCHES, height), facecolor="white")
         draw(figure, *what)
         file = io.BytesIO()
         figure.savefig(file, format="svg", dpi=RASTER_DPI, metadata={"Date": None})
@@ -265,43 +293,53 @@ def _drawn(draw: Callable[..., None], height: float, *what: Any, width: float = 
 # The record in words
 
 
-def facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What a run did, in pairs of a name and a value; what the record lacks is left out."""
+def facts(record: Mapping[str, Any], period: float | None = None) -> list[tuple[str, str]]:
+    """What a run did, in pairs of a name and a value; what the record lacks is left out. period: of angles."""
     noise, removed, smoothness, used = (
         record.get(key) or {} for key in ("Noise", "Removed", "Smoothness", "Parameters")
     )
     flow = " ".join(str(used[key]) for key in ("flow", "phi") if used.get(key) is not None)
-    beta = used.get("beta")
+    of = style.unit(period)
+    beta = _chosen_beta(record) or used.get("beta")
+    seconds = [
+        spent for phase, spent in (record.get("Seconds") or {}).items() if phase != "report" and spent is not None
+    ]
     found = {
-        "Noise": _change(_together(noise.get("sd")), _together(noise.get("after"))),
-        "Removed (rms)": _figure(removed.get("rms")),
-        "Smoothness (FWHM)": _change(smoothness.get("before_mm"), smoothness.get("after_mm"), " mm"),
+        "Noise": _change(_together(noise.get("sd"), of), _together(noise.get("after"), of)),
+        "Removed (rms)": _figure(removed.get("rms"), of),
+        "Smoothness (FWHM)": _change(_figure(smoothness.get("before_mm")), _figure(smoothness.get("after_mm"), " mm")),
         "Iterations": _figure(record.get("Iterations")),
         "Stopped by": str(record.get("StopReason") or ""),
         "Flow": flow + (f", beta {_figure(beta)}" if beta is not None else ""),
+        "Denoised in": f"{sum(seconds):,.1f} s" if seconds else "",
     }
     return [(name, value) for name, value in found.items() if value]
 
 
-def _change(before: float | None, after: float | None, unit: str = "") -> str:
-    if before is None and after is None:
-        return ""
-    return f"{_figure(before) or '?'} → {_figure(after) or '?'}{unit}"
+def _chosen_beta(record: Mapping[str, Any]) -> float | None:
+    """What "auto" came to; None where beta was given, or where nothing was found."""
+    asked, choice = record.get("Parameters") or {}, record.get("Choice") or {}
+    return choice.get("beta") if str(asked.get("beta")).startswith("auto") else None
 
 
-def _together(per_channel: Sequence[float | None] | None) -> float | None:
+def _change(before: str, after: str) -> str:
+    return f"{before or '?'} → {after or '?'}" if before or after else ""
+
+
+def _together(per_channel: Sequence[float | None] | None, unit: str) -> str:
     """The root of the mean square of the known ones."""
     known = [sd for sd in per_channel or () if sd is not None]
-    return math.sqrt(sum(sd * sd for sd in known) / len(known)) if known else None
+    return _figure(math.sqrt(sum(sd * sd for sd in known) / len(known)), unit) if known else ""
 
 
-def _figure(value: Any) -> str:
-    """A number to three digits, whole ones in full; other things as they are."""
+def _figure(value: Any, unit: str = "") -> str:
+    """A number to three digits, whole ones in full; other things as they are; nothing for None."""
     if value is None:
         return ""
-    return f"{value:.3g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)
+    return (f"{value:.3g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)) + unit
 
 
+NONE = "–"
 # Shown elsewhere on the page, or drawn.
 _APART = ("Parameters", "Sources", "Outputs", "Warnings", "Seconds", "Choice", "PerIteration", "GeneratedBy", "Request")
 
@@ -309,7 +347,9 @@ _APART = ("Parameters", "Sources", "Outputs", "Warnings", "Seconds", "Choice", "
 def tables(record: Mapping[str, Any]) -> Iterator[Table]:
     """Everything that the record says, but what goes on for as long as the iterations."""
     if record.get("Parameters"):
-        yield Table("Parameters", list(_flat(record["Parameters"])))
+        beta = _chosen_beta(record)
+        used = record["Parameters"] if beta is None else {**record["Parameters"], "beta": f"{_text(beta)} (auto)"}
+        yield Table("Parameters", _pairs(used))
     choice = record.get("Choice") or {}
     if choice.get("table"):
         columns = list(dict.fromkeys(key for row in choice["table"] for key in row))
@@ -317,17 +357,24 @@ def tables(record: Mapping[str, Any]) -> Iterator[Table]:
         yield Table("Automatic choice: what was tried", rows, [_spelt(key) for key in columns])
     chosen = {key: value for key, value in choice.items() if key not in ("table", "errors")}
     if chosen:
-        yield Table("Automatic choice", list(_flat(chosen)))
+        yield Table("Automatic choice", _pairs(chosen))
     if record.get("Sources"):
         rows = [[_text(source.get(key)) for key in ("Role", "Path", "SHA256")] for source in record["Sources"]]
         yield Table("Sources", rows, ["Role", "Path", "SHA-256"])
     if record.get("Outputs"):
         yield Table("Outputs", [[_text(file)] for file in record["Outputs"]], ["Path"])
     if record.get("Seconds"):
-        yield Table("Seconds", list(_flat(record["Seconds"])))
+        yield Table("Seconds", _pairs(record["Seconds"]))
     rest = {key: value for key, value in record.items() if key not in _APART}
     if rest:
-        yield Table("Further figures", list(_flat(rest)))
+        yield Table("Further figures", _pairs(rest))
+
+
+def _pairs(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Pairs of a name and a value; the names of those without a value in one line, the last."""
+    found = list(_flat(record))
+    unset = ", ".join(name for name, value in found if value == NONE)
+    return [(name, value) for name, value in found if value != NONE] + ([("not set", unset)] if unset else [])
 
 
 def _flat(record: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
@@ -347,7 +394,7 @@ def _spelt(key: object) -> str:
 def _text(value: Any) -> str:
     """A value as a reader expects it, numbers to six digits."""
     if value is None:
-        return "–"
+        return NONE
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
