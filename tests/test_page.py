@@ -339,3 +339,11 @@ def test_the_index_knows_where_it_will_be(tmp_path):
 def test_an_index_of_no_job(tmp_path):
     index.write(tmp_path / "i.html", [], {})
     assert "0 jobs" in (tmp_path / "i.html").read_text()
+
+
+def test_a_vertex_without_a_triangle_does_not_shrink_the_surface():
+    mesh = sphere(2)
+    lonely = Mesh(np.concatenate([mesh.vertices_ras_mm, [[1e4, 0, 0]]]), mesh.cells)
+    count = len(lonely.vertices_ras_mm)
+    scene, _ = page._scene(Subject("s", (Map("a", np.arange(count, dtype=float)),), lonely), 1)
+    assert np.allclose(scene["forms"][0]["half"], 0.5, atol=0.01)

@@ -343,11 +343,13 @@ function drawSurface(scene) {
   function told(map, vertex) {
     const value = map.values[channel][vertex];
     if (!Number.isFinite(value)) return "missing";
-    return figure(value) + scene.unit + (map.filled && map.filled[vertex] ? " (filled)" : "");
+    const { low, high } = scene.scales[channel];
+    return toStep(value, (high - low) / 200) + scene.unit + (map.filled && map.filled[vertex] ? " (filled)" : "");
   }
 
-  function figure(value, digits = 4) {
-    return String(Number(value.toPrecision(digits))).replace("-", "−");
+  // As many decimals as tell steps of this size apart.
+  function toStep(value, step) {
+    return value.toFixed(Math.min(20, Math.max(0, -Math.floor(Math.log10(step) + 1e-9)))).replace("-", "−");
   }
 
   // What the colours mean.
@@ -356,8 +358,8 @@ function drawSurface(scene) {
     const power = 10 ** Math.floor(Math.log10((high - low) / 4));
     const step = power * [1, 2, 5, 10].find((nice) => nice * power >= (high - low) / 6);
     const values = [];
-    for (let k = Math.ceil(low / step); k * step <= high; k++) values.push(Number((k * step).toPrecision(12)));
-    return values;
+    for (let k = Math.ceil(low / step); k * step <= high; k++) values.push(k * step);
+    return values.map((value) => [value, toStep(value, step)]);
   }
 
   function showKey() {
@@ -398,7 +400,7 @@ function drawSurface(scene) {
       part("hole", wheel);
       for (let quarter = 0; quarter < 4; quarter++) {
         const value = (quarter * period) / 4;
-        const label = part("b", wheel, figure(value < high ? value : value - period, 3) + scene.unit);
+        const label = part("b", wheel, toStep(value < high ? value : value - period, period / 40) + scene.unit);
         label.className = ["right", "top", "left", "bottom"][quarter];
       }
       // Polar angles of the visual field, where 90 is up.
@@ -410,8 +412,8 @@ function drawSurface(scene) {
     } else {
       const bar = part("bar", box);
       part("colours", bar).style.background = `linear-gradient(to top, ${steps.join(", ")})`;
-      for (const value of roundBetween(low, high)) {
-        part("b", bar, figure(value)).style.bottom = `${(100 * (value - low)) / (high - low)}%`;
+      for (const [value, text] of roundBetween(low, high)) {
+        part("b", bar, text).style.bottom = `${(100 * (value - low)) / (high - low)}%`;
       }
     }
   }

@@ -9,7 +9,7 @@ import base64
 import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -137,9 +137,10 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
     """What page.js draws, JSON-ready, and what a reader has to know about it."""
     whole = subject.mesh
     assert whole is not None
-    mesh, source, notes = whole, np.arange(len(whole.vertices_ras_mm)), []
-    if len(whole.cells) > TRIANGLES:
-        mesh, source = geometry.simplified(whole, TRIANGLES)
+    # In any case: vertices without a triangle, which may lie anywhere, are left out.
+    mesh, source = geometry.simplified(whole, TRIANGLES)
+    notes = []
+    if len(mesh.cells) < len(whole.cells):
         notes.append(
             f"3-D: shown with {len(mesh.cells):,} of {len(whole.cells):,} triangles; "
             "values as at the nearest original vertex."
@@ -152,6 +153,8 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
         if shown.filled is not None:
             filled |= shown.filled[source]
     is_cortex = geometry.is_cortex(whole)
+    if is_cortex and whole.structure is None:
+        whole = replace(whole, structure="Cortex")  # found once
     # The inflated one first: folds hide data in their sulci.
     forms = {"inflated": geometry.inflated(mesh), "folded": mesh} if is_cortex else {"surface": mesh}
     of_channels = [subject.channel(k) for k in range(channels)]
@@ -220,13 +223,8 @@ def _lifted(segments: np.ndarray, mesh: Mesh, height: float) -> np.ndarray:
 
     if not len(segments):
         return segments
-    a, b, c = (mesh.vertices_ras_mm[mesh.cells[:, k]] for k in range(3))
-    normals = np.zeros_like(mesh.vertices_ras_mm)
-    for k in range(3):
-        np.add.at(normals, mesh.cells[:, k], np.cross(b - a, c - a))
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     _, nearest = cKDTree(mesh.vertices_ras_mm).query(segments.reshape(-1, 3))
-    return segments + height * normals[nearest].reshape(segments.shape)
+    return segments + height * geometry.vertex_normals(mesh)[nearest].reshape(segments.shape)
 
 
 def _packed(array: np.ndarray, kind: type[np.generic]) -> str:
