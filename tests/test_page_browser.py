@@ -11,6 +11,7 @@ from browser import angles, browser, is_there, open_page, pixels, sphere
 from test_page import circle, row, three_channels
 
 from beltrami_cli.report import index, page
+from beltrami_cli.report.subject import Map, Subject
 
 pytestmark = [
     pytest.mark.slow,
@@ -330,3 +331,13 @@ def test_the_index_is_sorted_by_click_and_key(chromium, tmp_path):
     assert order() == "abc"
     assert window.locator('th[aria-sort="descending"]').inner_text().startswith("Seconds")
     assert log.errors == []
+
+
+def test_the_scale_tells_values_apart_that_differ_little(chromium, tmp_path):
+    mesh = sphere(2)
+    values = 15_000 + 30 * np.linspace(0, 1, len(mesh.vertices_ras_mm))
+    page.write(tmp_path / "p.html", Subject("s", (Map("a", values),), mesh))
+    window, _ = open_page(chromium, tmp_path / "p.html")
+    labels = window.locator("#key .bar b").all_inner_texts()
+    assert labels == ["15005", "15010", "15015", "15020", "15025"]
+    window.close()
