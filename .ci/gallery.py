@@ -1,6 +1,6 @@
 """Make the pictures of docs/gallery.md anew, by the commands that stand there: `python .ci/gallery.py`.
 
-They go to docs/images/gallery at the size that a page shows them in, for all pictures together are to stay under 3 MB.
+They go to docs/images/gallery without transparency, packed tightly: all pictures together stay under 3 MB.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from PIL import Image
 from beltrami_cli.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
-WIDTH = 1200  # pixels
 PICTURES = ROOT / "docs" / "images" / "gallery"
 
 
@@ -37,9 +36,7 @@ def make(folder: Path) -> None:
             raise SystemExit(code)
     PICTURES.mkdir(parents=True, exist_ok=True)
     for picture in sorted(folder.glob("*.png")):
-        whole = Image.open(picture).convert("RGB")
-        small = whole.resize((WIDTH, round(whole.height * WIDTH / whole.width)), Image.Resampling.LANCZOS)
-        small.save(PICTURES / picture.name, optimize=True)
+        Image.open(picture).convert("RGB").save(PICTURES / picture.name, optimize=True)
         print(f"docs/images/gallery/{picture.name}: {(PICTURES / picture.name).stat().st_size / 1000:.0f} kB")
 
 

@@ -17,7 +17,7 @@ from beltrami_cli import report
 from beltrami_cli.errors import DataError, RefusedError
 from beltrami_cli.grid import Grid
 from beltrami_cli.report import graphs, key, sheet, slices, style, surfaces
-from beltrami_cli.report.colours import FILLED, MISSING, Scale
+from beltrami_cli.report.colours import FILLED, INNER, MISSING, Scale
 from beltrami_cli.report.geometry import View
 from beltrami_cli.report.style import DENOISED, INPUT, TRUTH
 from beltrami_cli.report.subject import Map, Subject
@@ -39,12 +39,12 @@ RECORD = {
     "Choice": {"iterations": 2, "errors": [3.0, 2.0, 1.0, 1.5]},
     "PerIteration": {
         "beta": [0.1, 0.2],
-        "dt_over_beta": [1.5, None],
+        "dt_over_beta": [1.5, 0.75],
         "change_rms": [1.0, 0.01],
         "noise_sd": [{"iteration": 0, "sd": [2.0]}, {"iteration": 2, "sd": [0.5]}],
     },
     "Warnings": ["the first", "the second"],
-    "Seconds": {"read": 1.0, "flow": 2.0},
+    "Seconds": {"read": 1.0, "flow": 2.0, "report": 4.0},
 }
 
 
@@ -66,6 +66,19 @@ def box(n: int = 12) -> Mesh:
     ball = np.linalg.norm(np.stack(np.meshgrid(*[np.arange(n) - (n - 1) / 2] * 3)), axis=0) - n / 3
     vertices, cells, *_ = marching_cubes(ball, 0.0)
     return Mesh(vertices.astype(float), cells)
+
+
+def bowl() -> Mesh:
+    """A folded hemisphere of 45 mm left of x = 0, cut open in front."""
+    from skimage.measure import marching_cubes
+
+    at = np.stack(np.meshgrid(*[np.arange(50) - 24.5] * 3, indexing="ij")) * 2
+    polar, turn = np.arccos(np.clip(at[2] / np.linalg.norm(at, axis=0), -1, 1)), np.arctan2(at[1], at[0])
+    ball = np.linalg.norm(at, axis=0) - 38 - 6 * np.sin(8 * polar) ** 2 * np.cos(8 * turn)
+    vertices, cells, *_ = marching_cubes(ball, 0.0)
+    vertices = (vertices - 24.5) * 2
+    cells = cells[vertices[cells, 1].max(1) < 20]
+    return Mesh(vertices - np.array([46.0, 0, 0]), cells)
 
 
 def run_on(mesh: Mesh | None, grid: Grid | None = None, **changes: object) -> Subject:
@@ -215,7 +228,8 @@ def test_slices_show_values_where_they_are(tmp_path):
     ]
     assert sagittal.get_xlim() == (9.5, 19.5) and sagittal.get_ylim() == (-0.5, 29.5)  # cut to what is known
     assert axial.get_xlim() == (9.0, 11.0)
-    assert {text.get_text() for text in coronal.texts} == {"L", "R", "I", "S"}
+    assert {text.get_text() for text in sagittal.texts} == {"a", "P", "A", "I", "S"}
+    assert {text.get_text() for text in coronal.texts} == {"I", "S"}  # a single voxel wide
     assert share(saved(tmp_path, figure), VIRIDIS(1.0)) > 0.1
 
 
@@ -236,6 +250,36 @@ def test_slices_cut_where_the_data_are():
     cuts = slices.cuts_of(Subject("s", (Map("a", values, np.ones(grid.shape)),), mesh, grid))
     assert cuts.index[0] > 20 and abs(cuts.index[1] - 14.5) < 2
     assert (cuts.box[0] <= 2).all() and (cuts.box[1] >= 27).all()
+
+
+def test_slices_at_the_ends_of_a_volume_are_left_out():
+    mesh = box(30)
+    grid = Grid.from_spacing((30, 30, 30))
+    x = mesh.vertices_ras_mm[:, 0]
+    thick = replace(mesh, vertices_ras_mm=(mesh.vertices_ras_mm - 14.5) * 1.4 + 14.5)  # from 0.5 to 28.5
+    many = slices.cuts_of(Subject("s", (Map("a", np.where(x > 22.5, 1.0, np.nan)),), thick, grid)).index
+    assert 24 <= many[0] < 27
+    moved = replace(thick, vertices_ras_mm=thick.vertices_ras_mm + np.array([20.0, 0, 0]))
+    only = slices.cuts_of(Subject("s", (Map("a", np.where(x < 8, 1.0, np.nan)),), moved, grid)).index
+    assert only[0] < 27
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_slices_of_a_thin_slab_keep_their_letters_apart(axis):
+    shape = [60, 60, 60]
+    shape[axis] = 2
+    volume = np.random.default_rng(0).normal(size=shape)
+    subject = Subject("s", (Map("a", None, volume), Map("b", None, volume)), None, Grid.from_spacing(tuple(shape)))
+    subject = replace(subject, compares=True)
+    figure = Figure(figsize=(10, slices.height(subject, 10)))
+    slices.draw(figure, subject)
+    figure.draw_without_rendering()
+    texts = [text for axes in figure.axes for text in (axes.title, *axes.texts) if text.get_text()]
+    boxes = [text.get_window_extent().padded(-1) for text in texts]
+    for k, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[:k]), texts[k].get_text()
+    assert not {text.get_text() for axes in figure.axes[:3] for text in axes.texts} & set(("LR", "PA", "IS")[axis])
+    assert figure.axes[-1].get_window_extent().height > 50  # the bar of the difference
 
 
 def test_without_a_volume_the_outline_has_the_colours(tmp_path):
@@ -259,17 +303,69 @@ def test_histograms_count_what_both_maps_have():
     assert removed.get_title() == "removed (vertices): rms 1.73"
 
 
+@pytest.mark.parametrize(("count", "expected"), [(1, [DENOISED]), (2, [INPUT, DENOISED]), (3, style.LINES[:3])])
+def test_the_colours_and_the_legend_of_histograms(count, expected):
+    figure = Figure(figsize=(3, 2))
+    maps = tuple(Map(f"a name of some length {k}.nii.gz", np.arange(9.0)) for k in range(count))
+    graphs.histograms(figure, Subject("s", maps))
+    (axes,) = figure.axes
+    blocks = [patch for patch in axes.patches if patch.get_fill()]
+    assert [
+        to_rgb(patch.get_edgecolor() if not patch.get_fill() else patch.get_facecolor()) for patch in axes.patches
+    ] == [to_rgb(colour) for colour in expected]
+    assert len(blocks) == (count == 2)
+    if count > 1:
+        figure.draw_without_rendering()
+        legend = axes.get_legend().get_window_extent()
+        assert legend.y0 >= axes.get_window_extent().y1
+        assert axes.title.get_window_extent().y0 >= legend.y1 - 1
+        assert legend.x1 < figure.bbox.width and legend.y1 < figure.bbox.height
+
+
+def test_a_lobe_of_angles_around_0_is_not_split():
+    angles = np.random.default_rng(0).normal(10, 20, 2000) % 360
+    figure = Figure(figsize=(3, 2))
+    graphs.histograms(figure, Subject("s", (Map("a", angles),), period=360.0))
+    (axes,) = figure.axes
+    assert axes.get_xlim() == pytest.approx((-170, 190), abs=2)
+    drawn = axes.patches[0].get_xy()
+    full = drawn[drawn[:, 1] > 0, 0]
+    assert full.min() > -90 and full.max() < 110
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert labels == ["0°", "90°", "180°", "270°"]
+    assert axes.get_xticks() == pytest.approx([0, 90, 180, -90])
+
+
 def test_courses_over_the_iterations():
     figure = Figure(figsize=(10, 2))
     assert graphs.has_iterations(RECORD) and graphs.courses(RECORD) == 5
     graphs.iterations(figure, RECORD)
     at = {axes.get_title(): axes for axes in figure.axes}
-    assert list(at) == ["change, rms", "noise, sd", "held-out error, rms", "beta (mm per unit)", "dt / beta"]
+    assert list(at) == [
+        "change, rms",
+        "noise on the surface, sd",
+        "held-out error, rms",
+        "beta (mm per unit)",
+        "dt / beta",
+    ]
     assert at["change, rms"].get_yscale() == "log" and at["beta (mm per unit)"].get_yscale() == "linear"
     assert at["change, rms"].get_lines()[0].get_xdata().tolist() == [1, 2]
-    assert at["noise, sd"].get_lines()[0].get_xdata().tolist() == [0, 2]
+    noise, level = at["noise on the surface, sd"].get_lines()
+    assert noise.get_xdata().tolist() == [0, 2] and level.get_ydata() == [2.0, 2.0]
+    assert at["noise on the surface, sd"].texts[0].get_text() == "data: 2"
     assert at["held-out error, rms"].get_lines()[0].get_xdata().tolist() == [0, 1, 2, 3]
-    assert at["held-out error, rms"].texts[0].get_text() == "chosen: 2"
+    (chosen,) = at["held-out error, rms"].texts
+    assert chosen.get_text() == "chosen: 2" and chosen.get_ha() == "right" and chosen.xyann[0] < 0
+
+
+def test_the_noise_of_the_data_is_drawn_on_one_scale_with_what_is_left():
+    noise = [{"iteration": k, "sd": [sd]} for k, sd in enumerate((7.0, 1.0, 0.6))]
+    figure = Figure(figsize=(3, 2))
+    record = {"Noise": {"sd": [39.9], "after": [0.6]}, "PerIteration": {"noise_sd": noise}}
+    graphs.iterations(figure, record | {"Parameters": {"period": 360.0}})
+    (axes,) = figure.axes
+    assert axes.get_yscale() == "log" and axes.get_ylim()[1] > 39.9  # 7 to 0.6 alone would be linear
+    assert axes.texts[0].get_text() == "data: 39.9°"
 
 
 @pytest.mark.parametrize(
@@ -280,7 +376,8 @@ def test_courses_over_the_iterations():
         ({"PerIteration": None, "Noise": None, "Choice": None, "Iterations": 0}, 0),
         ({"Noise": {"sd": [None], "after": [None]}, "Iterations": 3}, 0),
         ({"Noise": {"sd": [2.0], "after": [1.0]}, "Iterations": 3}, 1),
-        ({"PerIteration": {"beta": [0.1], "change_rms": [], "noise_sd": [{"iteration": 0, "sd": [None]}]}}, 1),
+        ({"PerIteration": {"beta": [0.1], "change_rms": [], "noise_sd": [{"iteration": 0, "sd": [None]}]}}, 0),
+        ({"PerIteration": {"beta": [0.1, 0.1], "noise_sd": [{"iteration": 0, "sd": [7.0]}]}}, 1),
     ],
 )
 def test_courses_of_records_that_lack_something(record, expected):
@@ -314,6 +411,12 @@ def test_the_key_says_what_grey_and_outlines_mean():
     assert bar.get_title() == "map"
     assert [axes.texts[0].get_text() for axes in swatches] == ["no data", "filled in: paler,\nno data before"]
     assert swatches[0].get_facecolor()[:3] == MISSING
+
+
+def test_the_key_without_any_value():
+    figure = Figure(figsize=(2, 2))
+    key.draw(figure, None, missing=True)
+    assert [axes.texts[0].get_text() for axes in figure.axes] == ["no data"]
 
 
 # The sheet
@@ -353,10 +456,66 @@ def test_a_sheet_without_any_value(tmp_path):
     assert share(imread(tmp_path / "sheet.png")[..., :3], MISSING) > 0.01
 
 
+def test_without_any_value_there_is_nothing_to_count(tmp_path, monkeypatch):
+    mesh = box()
+    bare = Map("nothing", np.full(len(mesh.vertices_ras_mm), np.nan))
+    text = words(Subject("s", (bare,), mesh), tmp_path, monkeypatch).split("\n")
+    assert "no values" in text and "no data" in text
+    assert not any(line.startswith("values") for line in text)
+
+
+def test_a_run_that_changed_nothing(tmp_path, monkeypatch):
+    record = RECORD | {
+        "Parameters": {"beta": "auto", "stop": "auto"},
+        "Iterations": 0,
+        "Choice": {"beta": 0.125, "iterations": 0, "errors": [1.0, 2.0]},
+        "PerIteration": {"beta": [], "change_rms": [], "noise_sd": [{"iteration": 0, "sd": [2.0]}]},
+    }
+    text = words(run_on(box(), record=record), tmp_path, monkeypatch)
+    assert "0 iterations" in text and "the flow changed nothing" in text
+    assert text.split("\n").count("auto") == 1 and "0.125" in text  # stop: auto
+    assert "noise on the surface" not in text and "held-out error, rms" in text
+
+
+@pytest.mark.parametrize("count", [0, 20])
+def test_the_key_speaks_of_filled_places_where_some_are_seen(count, tmp_path, monkeypatch):
+    mesh = box(30)
+    first, last = run_on(mesh).maps
+    filled = np.arange(len(mesh.vertices_ras_mm)) < count
+    subject = replace(run_on(mesh), maps=(first, replace(last, filled=filled)))
+    assert ("filled in" in words(subject, tmp_path, monkeypatch)) == (count > 0)
+
+
+def test_the_inner_side_of_a_surface_that_is_cut_open_has_no_data(tmp_path):
+    colours = np.full((4, 4), [1.0, 0, 0, 1])
+    for view, red in ((ABOVE, True), (View("below", np.diag([-1.0, 1, -1])), False)):
+        figure = Figure(figsize=(2, 2))
+        surfaces.draw(figure.add_axes((0, 0, 1, 1)), squares(0.0), colours, view, plain_inside=True)
+        assert share(saved(tmp_path, figure), (1, 0, 0) if red else INNER) > 0.9
+
+
+def test_a_side_taken_from_the_position_is_said(tmp_path, monkeypatch):
+    half = bowl()
+    assert "taken for a left hemisphere, by its position" in words(run_on(half), tmp_path, monkeypatch)
+    named = replace(half, structure="CortexLeft")
+    text = words(run_on(named), tmp_path, monkeypatch)
+    assert "lateral, inflated" in text and "by its position" not in text
+
+
+def test_close_by_what_was_filled_in_is_shown_too():
+    mesh = box(30)
+    along = mesh.vertices_ras_mm @ [1.0, 1, 0]
+    values = np.where(along > 42, 1.0, np.nan)
+    one = Map("before", values)
+    grown = Map("after", np.where(along > 40.5, 1.0, np.nan), None, (along > 40.5) & (along <= 42))
+    narrow, wide = (sheet._seen(Subject("s", maps, mesh)).close_up() for maps in ((one, one), (one, grown)))
+    assert (wide.box[0] < narrow.box[0]).any() and (wide.box[1] > narrow.box[1]).any()
+
+
 def test_the_words_of_a_run(tmp_path, monkeypatch):
     text = words(run_on(replace(box(), structure="CortexLeft"), SPACE, notes=("a note",)), tmp_path, monkeypatch)
     assert "noise 2 → 0.5   ·   removed 1.5 rms   ·   smoothness 1.0 → 4.0 mm FWHM" in text
-    assert "2 iterations (stop: iterations)   ·   3.0 s" in text
+    assert "2 iterations (stop: iterations)   ·   denoised in 3.0 s" in text
     assert "Warning: the first\nWarning: the second" in text
     for expected in (
         "a note",
@@ -385,6 +544,7 @@ def test_many_maps_are_a_figure_of_panels(tmp_path, monkeypatch):
     text = words(Subject("a figure", maps, mesh), tmp_path, monkeypatch)
     assert [line for line in text.split("\n") if line.startswith("beta")] == [f"beta {k}" for k in range(5)]
     assert "values" not in text and "lateral" not in text
+    assert imread(tmp_path / "sheet.png").shape[1] == 1200
     sheet.draw(
         tmp_path / "flat.png",
         Subject("f", tuple(Map(str(k), None, np.ones(SPACE.shape)) for k in range(3)), None, SPACE),

@@ -90,10 +90,9 @@ def test_a_real_cortex(shared_data):
 # From where it is seen
 
 
-@pytest.mark.parametrize(("shift", "side", "out"), [(-60.0, "left", -1), (60.0, "right", 1)])
+@pytest.mark.parametrize(("shift", "side", "out"), [(-35.0, "left", -1), (35.0, "right", 1)])
 def test_the_sides_of_a_hemisphere(shift, side, out):
-    mesh = sphere(ripple=8.0)
-    mesh = replace(mesh, vertices_ras_mm=mesh.vertices_ras_mm + np.array([shift, 0, 0]))
+    mesh = moved(sphere(radius=30.0, ripple=8.0), [shift, 0, 0])
     assert geometry.hemisphere(mesh) == side
     found = {view.name: view.camera for view in views(mesh)}
     assert list(found) == ["lateral", "medial", "dorsal", "posterior"]
@@ -101,6 +100,38 @@ def test_the_sides_of_a_hemisphere(shift, side, out):
     assert np.allclose(found["medial"][2], [-out, 0, 0])
     assert np.allclose(found["dorsal"], np.eye(3))
     assert np.allclose(found["posterior"], [[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # left is left
+
+
+def moved(mesh: Mesh, by: list[float]) -> Mesh:
+    return replace(mesh, vertices_ras_mm=mesh.vertices_ras_mm + by)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        moved(sphere(radius=30.0, ripple=8.0), [45.0, 45, 45]),  # counted from a corner of the volume
+        moved(sphere(radius=30.0, ripple=8.0), [-45.0, -45, 45]),  # the same in LPS
+        moved(sphere(radius=30.0, ripple=8.0), [120.0, 0, 0]),  # in no head
+        replace(
+            moved(s := sphere(ripple=8.0), [60.0, 0, 0]),
+            cells=s.cells[np.abs(s.vertices_ras_mm[s.cells, 2]).max(1) < 6],
+        ),
+    ],
+    ids=["corner", "corner in LPS", "far out", "slab"],
+)
+def test_positions_that_tell_no_hemisphere(mesh):
+    mesh = replace(mesh, structure="Cortex")
+    assert geometry.hemisphere(mesh) is None
+    assert [view.name for view in views(mesh)] == ["right", "front", "above", "three-quarter"]
+    assert geometry.hemisphere(replace(mesh, structure="CortexRight")) == "right"
+
+
+def test_which_side_is_the_inner_one():
+    ball, sheet = sphere(20), patch()
+    assert geometry.outwards(ball) > 0.99
+    assert geometry.outwards(replace(ball, cells=ball.cells[:, ::-1])) < -0.99
+    assert abs(geometry.outwards(sheet)) < 0.01
+    assert geometry.is_open(sheet) and not geometry.is_open(ball)
 
 
 def test_both_hemispheres_are_seen_from_the_left_and_the_right():
@@ -225,6 +256,7 @@ def test_the_border_of_filled_places():
     assert np.linalg.norm(np.diff(segments, axis=1)[:, 0], axis=1).sum() == pytest.approx(81, abs=0.5)
     assert all(filled[mesh.cells[cell]].any() and not filled[mesh.cells[cell]].all() for cell in cells)
     assert geometry.filled_border(mesh, np.zeros(len(x), bool)).shape == (0, 2, 3)
+    assert geometry.is_filled(mesh, filled) and not geometry.is_filled(mesh, np.arange(len(x)) == 3 * 241 + 3)
 
 
 def test_the_outline_in_a_slice_of_any_grid():
@@ -244,3 +276,10 @@ def test_the_outline_of_a_curve_is_the_curve():
     segments, cells = geometry.outline(mesh, Grid.from_spacing((8, 8)), 2, 0)
     assert segments.tolist() == [[[1, 2], [3, 2]], [[3, 2], [3, 5]]]
     assert cells.tolist() == [0, 1]
+
+
+def test_the_sides_of_real_crops(shared_data):
+    for name in ("s1_individual/lh.mid.crop", "retino_fsaverage/lh.crop", "retino_hcp7t_measured/lh.crop"):
+        mesh = replace(read_surface(shared_data / f"{name}.surf.gii"), structure=None)
+        assert geometry.hemisphere_by_position(mesh) == "left"
+        assert views(mesh)[0].name == "lateral"

@@ -15,6 +15,8 @@ PERCENTILES = (2.0, 98.0)  # a few outliers must not take the whole colour scale
 # sulci are a little darker than gyri.
 MISSING = (0.74, 0.74, 0.74)
 MISSING_SULCUS = (0.64, 0.64, 0.64)
+# Of the inner side of a surface that is cut open.
+INNER = (0.88, 0.88, 0.88)
 # Around places that were filled in: no colour of a map. Inside, so much of their colour gives way to grey.
 FILLED = "#d6006c"
 FADING = 0.45
@@ -97,6 +99,11 @@ def values_of(shown: Map) -> np.ndarray:
     values = shown.volume if shown.values is None else shown.values
     assert values is not None
     return np.ravel(values)
+
+
+def has_values(subject: Subject) -> bool:
+    """True where a map of a subject, of one channel, has any value."""
+    return any(bool(np.isfinite(values_of(shown)).any()) for shown in subject.maps)
 
 
 def scale_of(subject: Subject) -> Scale:

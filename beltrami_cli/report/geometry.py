@@ -30,6 +30,10 @@ ONE_SIDED = 0.1
 # folds, and a patch must keep its form.
 INFLATION, INFLATION_SHARE, INFLATION_STEPS = 600.0, 0.02, 4
 
+# Where a cortex lies in a scanner, whose origin is somewhere in the head: nowhere farther than so many mm from it along
+# x, y and z; a hemisphere reaches across the midline by less than so much; and it is thicker than a slab.
+HEAD, ACROSS, SLAB = (90.0, 130.0, 110.0), 10.0, 20.0
+
 # What counts as folded: half of the integral of |mean curvature| by the root of the area, of gyri and of sulci. Convex
 # surfaces and tori have no sulci, two flat banks 0.3; patches of cortex of 10,000 to 40,000 mm^2 have 4 to 16.
 FOLDED = 1.5
@@ -64,38 +68,66 @@ def is_cortex(mesh: Mesh) -> bool:
     return bool(min(gyri, sulci) > FOLDED * np.sqrt(area.sum()))
 
 
-def hemisphere(mesh: Mesh) -> str:
-    """`left` or `right`: by its structure, else by the side of x = 0 on which most of its vertices lie."""
-    for side in ("Left", "Right"):
-        if mesh.structure is not None and mesh.structure.endswith(side):
-            return side.lower()
-    return "left" if np.median(_used(mesh)[:, 0]) < 0 else "right"
+def hemisphere(mesh: Mesh) -> str | None:
+    """`left` or `right`: by its structure, else by its position; None where neither tells."""
+    if mesh.structure is not None:
+        for side in ("Left", "Right"):
+            if mesh.structure.endswith(side):
+                return side.lower()
+    return hemisphere_by_position(mesh)
+
+
+def hemisphere_by_position(mesh: Mesh) -> str | None:
+    """`left` or `right` of x = 0, where the vertices lie as those of one hemisphere in a scanner do; else None.
+
+    Not those of a slab, and none whose coordinates have one sign along each axis: as a rule they count from a corner.
+    """
+    low, high = _extent(mesh)
+    if not _is_in_a_head(mesh) or (low * high >= 0).all():
+        return None
+    return "left" if high[0] < ACROSS else "right" if low[0] > -ACROSS else None
 
 
 def _has_both_hemispheres(mesh: Mesh) -> bool:
     if mesh.structure is not None and mesh.structure.endswith(("Left", "Right")):
         return False
     on_the_left = float((_used(mesh)[:, 0] < 0).mean())
-    return 0.3 < on_the_left < 0.7
+    return 0.3 < on_the_left < 0.7 and _is_in_a_head(mesh)
+
+
+def _is_in_a_head(mesh: Mesh) -> bool:
+    """True where the coordinates can be those of a cortex in scanner RAS, and it is no slab."""
+    low, high = _extent(mesh)
+    points = _used(mesh) - _used(mesh).mean(0)
+    along = points @ np.linalg.eigh(points.T @ points)[1]
+    thinnest = np.ptp(np.percentile(along, (1, 99), axis=0), axis=0).min()
+    return bool((np.maximum(-low, high) < HEAD).all() and thinnest > SLAB)
+
+
+def _extent(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """(3,) and (3,) least and greatest coordinates, but for a few."""
+    low, high = np.percentile(_used(mesh), (1, 99), axis=0)
+    return low, high
 
 
 def views(mesh: Mesh) -> list[View]:
-    """Four: lateral, medial, dorsal, posterior of a cortex; right, front, above, three-quarter otherwise.
+    """Four: lateral, medial, dorsal, posterior of a hemisphere; right, front, above, three-quarter otherwise.
 
     A cortex of both hemispheres hides its medial sides: it is seen from the left and the right.
     """
-    if not is_cortex(mesh):
-        names = ("right", "front", "above", "three-quarter")
-    elif _has_both_hemispheres(mesh):
-        names = ("left", "right", "dorsal", "posterior")
-    else:
-        names = ("lateral", "medial", "dorsal", "posterior")
+    names = ("right", "front", "above", "three-quarter")
+    if is_cortex(mesh):
+        if _has_both_hemispheres(mesh):
+            names = ("left", "right", "dorsal", "posterior")
+        elif hemisphere(mesh) is not None:
+            names = ("lateral", "medial", "dorsal", "posterior")
     return [from_side(mesh, name) for name in names]
 
 
 def from_side(mesh: Mesh, name: str) -> View:
-    """The view from a side, a name in `SIDES`."""
-    mirrored = name in ("lateral", "medial") and hemisphere(mesh) == "right"
+    """The view from a side, a name in `SIDES`. Of a surface of an unknown side, lateral is away from x = 0."""
+    side = hemisphere(mesh) or ("left" if np.median(_used(mesh)[:, 0]) < 0 else "right")
+    mirrored = name in ("lateral", "medial") and side == "right"
     return View(name, camera(-SIDES[name] if mirrored else SIDES[name]))
 
 
@@ -252,6 +284,19 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
 
+def is_open(mesh: Mesh) -> bool:
+    """True for a surface with a border."""
+    return bool(len(_border_edges(mesh)))
+
+
+def outwards(mesh: Mesh) -> float:
+    """How much the triangles face away from the middle: 1 of a ball, -1 of one inside out, 0 of a flat patch."""
+    areas = area_vectors(mesh)
+    away = mesh.vertices_ras_mm[mesh.cells].mean(1) - _used(mesh).mean(0)
+    most = (np.linalg.norm(areas, axis=1) * np.linalg.norm(away, axis=1)).sum()
+    return float((areas * away).sum() / max(most, 1e-30))
+
+
 def _vertex_areas(mesh: Mesh) -> np.ndarray:
     """(V,) a third of the area of the triangles around each vertex, mm^2."""
     area = np.linalg.norm(area_vectors(mesh), axis=1)
@@ -264,6 +309,12 @@ def _used(mesh: Mesh) -> np.ndarray:
 
 
 # Lines on a surface
+
+
+def is_filled(mesh: Mesh, filled: np.ndarray) -> bool:
+    """True where more of the surface was filled, (V,) bool, than a speck."""
+    area = _vertex_areas(mesh)
+    return bool(area[filled].sum() > SPECK * area.sum())
 
 
 def filled_border(mesh: Mesh, filled: np.ndarray) -> np.ndarray:

@@ -3,24 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from beltrami_cli.report.colours import values_of
-from beltrami_cli.report.style import DENOISED, FAINT, INPUT, LINES, TRUTH, grid_of_axes, unit
+from beltrami_cli.report.style import DENOISED, FAINT, INPUT, LINES, TRUTH, grid_of_axes, legend_above, points, unit
 from beltrami_cli.report.subject import Subject
 from beltrami_cli.surface import Mesh
 
 BINS = 90
 
 
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Values y over iterations x. chosen: the iteration that was. level: a value to compare with, and its name."""
+
+    title: str
+    x: np.ndarray
+    y: np.ndarray
+    chosen: int | None = None
+    level: tuple[float, str] | None = None
+
+
+def _colours(subject: Subject) -> tuple[str, ...]:
+    """Of the lines of its maps: two are an input and what became of it, and the first of more is the truth."""
+    return {1: (DENOISED,), 2: (INPUT, DENOISED)}.get(len(subject.maps), LINES)
+
+
 def curve(figure: Any, subject: Subject, label: str = "value") -> None:
     """Of a curve: one line for each map over the arc length, the roughest behind."""
     assert subject.mesh is not None
-    (axes,) = grid_of_axes(figure, 1, 1, top=0.35)[0]
+    letters = points() / 8
+    (axes,) = grid_of_axes(figure, 1, 1, left=0.5 * letters, bottom=0.4 * letters, top=0.1)[0]
     vertices, arc = along(subject.mesh)
-    colours = (INPUT, DENOISED) if subject.compares else LINES
+    colours = _colours(subject)
     lines = []
     for k, shown in enumerate(subject.maps):
         assert shown.values is not None
@@ -37,15 +55,8 @@ def curve(figure: Any, subject: Subject, label: str = "value") -> None:
     axes.set_ylabel(label)
     axes.margins(x=0)
     axes.grid(alpha=0.25)
-    handles = {handle.get_label(): handle for handle in axes.get_lines()}
-    axes.legend(
-        handles=[handles[title] for *_, title in lines],
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        ncols=len(lines),
-        frameon=False,
-        fontsize="medium",
-    )
+    drawn = dict(zip(order.tolist(), axes.get_lines(), strict=True))
+    legend_above(axes, [drawn[k] for k in range(len(lines))])
 
 
 def along(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -84,30 +95,39 @@ def draw_histograms(all_axes: np.ndarray, subject: Subject) -> None:
     values = [values_of(shown) for shown in subject.maps]
     known = np.isfinite(values[0])
     values = [np.asarray(v[known & np.isfinite(v)], float) for v in values]
-    if subject.period is not None:
-        low, high = subject.low, subject.low + subject.period
-    else:
+    axes, colours = all_axes[0], _colours(subject)
+    if subject.period is None:
         everything = np.concatenate(values)
         low, high = np.percentile(everything, (0.2, 99.8)) if everything.size else (0.0, 1.0)
+    else:
+        low, high = _around_the_mean(axes, values[-1], subject.low, subject.period)
+        values = [low + (v - low) % subject.period for v in values]
     bins = np.linspace(low, high if high > low else low + 1, BINS + 1)
-    colours = (INPUT, DENOISED) if subject.compares else LINES
-    axes = all_axes[0]
+    handles = []
     for k, (shown, v) in enumerate(zip(subject.maps, values, strict=True)):
-        colour = colours[k % len(colours)]
-        is_first = k == 0 and len(values) > 1
-        axes.hist(
-            v, bins, color=colour, label=shown.title, histtype="stepfilled" if is_first else "step", linewidth=1.2
-        )
-    axes.set_title(f"values ({int(known.sum()):,} {_places(subject)})")
+        form = "stepfilled" if k == 0 and len(values) == 2 else "step"
+        drawn = axes.hist(v, bins, color=colours[k % len(colours)], label=shown.title, histtype=form, linewidth=1.2)
+        handles.append(drawn[2][0])
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
     axes.margins(x=0)
-    if subject.period is not None:
-        quarters = subject.low + subject.period * np.arange(5) / 4
-        axes.set_xticks(quarters, [f"{angle:.3g}{unit(subject.period)}" for angle in quarters])
-    axes.legend(frameon=False, loc="best")
+    title = f"values ({int(known.sum()):,} {_places(subject)})"
+    if len(handles) > 1:
+        legend_above(axes, handles, title)
+    else:
+        axes.set_title(title)
     if subject.compares:
         _histogram_of_differences(all_axes[1], subject)
+
+
+def _around_the_mean(axes: Any, angles: np.ndarray, low: float, period: float) -> tuple[float, float]:
+    """A range about the circular mean of angles, so that none of their lobes is cut, and ticks in their own range."""
+    turn = 2 * np.pi / period
+    mean = float(np.angle(np.exp(1j * turn * angles).sum())) / turn
+    start = mean - period / 2
+    quarters = low + period * np.arange(4) / 4
+    axes.set_xticks(start + (quarters - start) % period, [f"{angle:.3g}{unit(period)}" for angle in quarters])
+    return start, start + period
 
 
 def _histogram_of_differences(axes: Any, subject: Subject) -> None:
@@ -139,20 +159,29 @@ def iterations(figure: Any, record: Mapping[str, Any], period: float | None = No
 
 def draw_iterations(all_axes: np.ndarray, record: Mapping[str, Any]) -> None:
     """The same on axes that are there, as many as `courses` counts."""
-    for axes, (title, x, y, chosen) in zip(all_axes, _courses(record), strict=False):
+    for axes, course in zip(all_axes, _courses(record), strict=False):
+        x, y = course.x, course.y
         axes.plot(x, y, color=DENOISED, linewidth=1.4, marker="o", markersize=3 if len(x) < 40 else 0)
-        positive = y[np.isfinite(y) & (y > 0)]
-        if positive.size == np.isfinite(y).sum() and positive.size and positive.max() > 20 * positive.min():
-            _to_log(axes, positive)
-        if chosen is not None:
-            axes.axvline(chosen, color=TRUTH, linewidth=1, linestyle="--")
+        finite = np.append(y[np.isfinite(y)], course.level[0] if course.level else [])
+        if finite.min() > 0 and finite.max() > 20 * finite.min():
+            _to_log(axes, finite)
+        elif np.ptp(finite) == 0:
+            axes.set_ylim(*sorted((0, 2 * float(finite[0]) or 1.0)))
+        if course.level is not None:
+            axes.axhline(course.level[0], color=FAINT, linewidth=1, linestyle="--")
             axes.annotate(
-                f"chosen: {chosen}", (chosen, 0.97), (3, 0), ("data", "axes fraction"), "offset points",
-                va="top", color=TRUTH, fontsize="small",
+                course.level[1], (1, course.level[0]), (-2, -2), ("axes fraction", "data"), "offset points",
+                ha="right", va="top", color=FAINT, fontsize="small",
             )  # fmt: skip
-        if np.ptp(y[np.isfinite(y)]) == 0:
-            axes.set_ylim(*sorted((0, 2 * float(np.nanmax(y)) or 1.0)))
-        axes.set_title(title)
+        if course.chosen is not None:
+            axes.axvline(course.chosen, color=TRUTH, linewidth=1, linestyle="--")
+            is_right = course.chosen > (x[0] + x[-1]) / 2
+            axes.annotate(
+                f"chosen: {course.chosen}", (course.chosen, 0.97), (-3 if is_right else 3, 0),
+                ("data", "axes fraction"), "offset points",
+                ha="right" if is_right else "left", va="top", color=TRUTH, fontsize="small",
+            )  # fmt: skip
+        axes.set_title(course.title)
         axes.set_xlabel("iteration", labelpad=1)
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.grid(alpha=0.25)
@@ -174,26 +203,29 @@ def courses(record: Mapping[str, Any] | None) -> int:
     return len(_courses(record))
 
 
-def _courses(record: Mapping[str, Any] | None) -> list[tuple[str, np.ndarray, np.ndarray, int | None]]:
-    """Title, iterations, values and the chosen iteration of whatever a record holds; any of its keys may be missing."""
+def _courses(record: Mapping[str, Any] | None) -> list[Course]:
+    """Of whatever a record holds, any of whose keys may be missing; a single value is no course."""
     record = record or {}
-    steps = record.get("PerIteration") or {}
+    steps, sd = record.get("PerIteration") or {}, record.get("Noise") or {}
     found = []
 
-    def add(title: str, values: Any, x: Any = None, chosen: int | None = None, first: int = 1) -> None:
+    def add(title: str, values: Any, x: Any = None, first: int = 1, **more: Any) -> None:
         y = np.array([np.nan if value is None else value for value in values or []], float)
-        if np.isfinite(y).any():
-            found.append((title, np.arange(first, first + len(y)) if x is None else np.asarray(x), y, chosen))
+        if np.isfinite(y).sum() > 1:
+            found.append(Course(title, np.arange(first, first + len(y)) if x is None else np.asarray(x), y, **more))
 
     add("change, rms", steps.get("change_rms"))
-    noise = steps.get("noise_sd")
-    if noise:
-        add("noise, sd", [(one.get("sd") or [None])[0] for one in noise], [one["iteration"] for one in noise])
-    elif record.get("Noise") and record.get("Iterations"):
-        ends = [(record["Noise"].get(name) or [None])[0] for name in ("sd", "after")]
-        add("noise, sd", ends, [0, record["Iterations"]])
+    before, after = ((sd.get(name) or [None])[0] for name in ("sd", "after"))
+    if noise := steps.get("noise_sd"):
+        # Carried to the surface and averaged over depth, values are less noisy from the start than the data are.
+        of = unit((record.get("Parameters") or {}).get("period"))
+        level = None if before is None else (before, f"data: {before:.3g}{of}")
+        x = [one["iteration"] for one in noise]
+        add("noise on the surface, sd", [(one.get("sd") or [None])[0] for one in noise], x, level=level)
+    elif record.get("Iterations"):
+        add("noise, sd", [before, after], [0, record["Iterations"]])
     choice = record.get("Choice") or {}
-    add("held-out error, rms", choice.get("errors"), chosen=choice.get("iterations"), first=0)
+    add("held-out error, rms", choice.get("errors"), first=0, chosen=choice.get("iterations"))
     add("beta (mm per unit)", steps.get("beta"))
     if len(set(steps.get("beta") or [])) > 1:
         add("dt / beta", steps.get("dt_over_beta"))

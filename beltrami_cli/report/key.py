@@ -7,35 +7,51 @@ from typing import Any
 import numpy as np
 
 from beltrami_cli.report.colours import FILLED, MISSING, Scale
-from beltrami_cli.report.style import FAINT, INK, unit
+from beltrami_cli.report.style import FAINT, INK, points, unit
 
 # Polar angles in degrees, 0 at the right horizontal meridian, are by far the most common angles of this period.
 VISUAL_FIELD = 360
+NOTE, TALLEST = 0.42, 1.15  # inches: of a line on what grey or an outline means; of a wheel, and of a bar at least
 QUADRANTS = ((1, 1, "upper\nright"), (-1, 1, "upper\nleft"), (-1, -1, "lower\nleft"), (1, -1, "lower\nright"))
 
 
-def draw(figure: Any, scale: Scale, *, label: str = "", missing: bool = False, filled: bool = False) -> None:
-    """What the colours mean: a bar, or a wheel for angles; what grey means; what the outline means."""
+def height(scale: Scale | None, notes: int) -> float:
+    """How many inches high `draw` is to be at least."""
+    return (0.35 if scale is None else sum(_margins(scale)) + TALLEST) + NOTE * notes
+
+
+def _margins(scale: Scale) -> tuple[float, float]:
+    """Above and below the bar or the wheel, in inches."""
+    return (0.35, 0.5) if scale.period else (0.1, 0.25)
+
+
+def draw(figure: Any, scale: Scale | None, *, label: str = "", missing: bool = False, filled: bool = False) -> None:
+    """What the colours mean: a bar, or a wheel for angles, neither without a scale; what grey and the outline mean."""
     width, height = figure.bbox.width / figure.dpi, figure.bbox.height / figure.dpi
     notes = [("no data", True)] * missing + [("filled in: paler,\nno data before", False)] * filled
-    above, below = (0.35, 0.5) if scale.period else (0.1, 0.25)
-    above += 0.2 if label else 0.0
-    left_over = height - above - below - 0.42 * len(notes)
-    tall = min(1.15, left_over, width - 0.9) if scale.period else min(2.2, left_over)
-    wide, left = (tall, (width - tall) / 2) if scale.period else (0.22, 0.35)
-    base = below + 0.42 * len(notes) + (left_over - tall) / 2
 
     def axes_at(x: float, y: float, w: float, h: float) -> Any:
         return figure.add_axes((x / width, y / height, w / width, h / height))
 
-    axes = axes_at(left, base, wide, tall)
-    (_wheel if scale.period else bar)(axes, scale)
-    axes.set_title(label, pad=30 if scale.period else 8)
+    if scale is None:
+        first = (height + NOTE * len(notes)) / 2
+    else:
+        above, below = _margins(scale)
+        above += 0.2 if label else 0.0
+        left_over = height - above - below - NOTE * len(notes)
+        tall = min(TALLEST, left_over, width - 0.9) if scale.period else min(2.2, left_over)
+        wide, left = (tall, (width - tall) / 2) if scale.period else (0.22, 0.35)
+        first = NOTE * len(notes) + (left_over - tall) / 2
+        axes = axes_at(left, first + below, wide, tall)
+        (_wheel if scale.period else bar)(axes, scale)
+        axes.set_title(label, pad=30 if scale.period else 8)
     for k, (text, is_missing) in enumerate(notes):
-        swatch = axes_at(0.25, base - below - 0.42 * (k + 1) + 0.12, 0.24, 0.2)
+        swatch = axes_at(0.25, first - NOTE * (k + 1) + 0.12, 0.24, 0.2)
         swatch.set(xticks=[], yticks=[], facecolor=MISSING if is_missing else "white")
         swatch.spines[:].set(visible=True, color=MISSING if is_missing else FILLED, linewidth=1.2)
-        swatch.annotate(text, (1, 0.5), (5, 0), "axes fraction", "offset points", va="center", fontsize="small")
+        swatch.annotate(
+            text, (1, 0.5), (5, 0), "axes fraction", "offset points", va="center", fontsize=points("legend.fontsize")
+        )
 
 
 def bar(axes: Any, scale: Scale, of: str = "") -> None:

@@ -12,18 +12,22 @@ import numpy as np
 
 from beltrami_cli.formats import checks
 from beltrami_cli.report import geometry, graphs, key, slices, style, surfaces
-from beltrami_cli.report.colours import MISSING_SULCUS, Scale, faded, scale_of, values_of
+from beltrami_cli.report.colours import MISSING_SULCUS, Scale, faded, has_values, scale_of, values_of
 from beltrami_cli.report.geometry import View
 from beltrami_cli.report.style import FAINT, unit
 from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.surface import Mesh
 
 WIDTH, DPI = 12.0, 150  # inches and pixels per inch: 1,800 pixels across
+COMPACT, COMPACT_KEY = 8.0, (1.35, 2.0)  # inches: a figure of many maps; its key with no more than a bar, and with more
 TRIANGLES = 60_000  # one covers about two pixels of a view
 KEY = 2.0  # inches
 FIRST = 1.35  # how much larger the view is that sees most of the data
 CLOSE_UP = 0.75  # share of the picture below which the data are shown from close by
 MARGIN = 0.06  # around them, of their size
+# By `geometry.outwards`: from here on a cortex has an inner side, which is seen where it is cut open. Crops of
+# hemispheres have 0.6 to 0.7; the ribbons of a slab 0.2, and of them both sides are looked at.
+OUTWARDS = 0.5
 
 # A block of the sheet: its height in inches, and what draws it into a SubFigure.
 Block = tuple[float, Callable[[Any], None]]
@@ -43,8 +47,9 @@ class Seen:
     """A surface made ready to be painted.
 
     folded, form: coarser copies, as it is and as it is shown first (inflated for a cortex). source: (V',) the vertex
-    whose value each vertex shows. sulci: (V',) bool. known: (V',) bool, where the first map has data. views: the one
-    first that is chosen, or else that sees most of the data.
+    whose value each vertex shows. sulci: (V',) bool. known: (V',) bool, where the first map has data; painted:
+    or the last. views: the one first that is chosen, or else that sees most of the data. plain_inside: as
+    `surfaces.draw` has it. position: the hemisphere that it is taken for by its position.
     """
 
     folded: Mesh
@@ -52,9 +57,12 @@ class Seen:
     source: np.ndarray
     sulci: np.ndarray
     known: np.ndarray
+    painted: np.ndarray
     views: list[View]
     is_cortex: bool
     chosen: bool
+    plain_inside: bool
+    position: str | None
 
     def colours(self, scale: Scale, shown: Map) -> np.ndarray:
         """(V', 4) colours of a map of the whole surface."""
@@ -80,7 +88,7 @@ class Seen:
         if self.chosen:
             return None
         view = geometry.best_view(self.form, self.known)
-        facing = self.known & (geometry.vertex_normals(self.form) @ view.camera[2] > 0)
+        facing = self.painted & (geometry.vertex_normals(self.form) @ view.camera[2] > 0)
         if not facing.any():
             return None
         flat = self.form.vertices_ras_mm[facing] @ view.camera[:2].T
@@ -101,10 +109,12 @@ def draw(path: Path, subject: Subject) -> None:
     shown = subject.channel(0)
     scale = scale_of(shown)
     seen = None if shown.mesh is None or shown.is_curve else _seen(shown)
-    blocks = _few(shown, scale, seen) if len(shown.maps) <= 2 else _many(shown, scale, seen)
-    blocks = [_headline(subject, seen), *blocks]
-    with rc_context(style.STYLE):
-        figure = Figure(figsize=(WIDTH, sum(height for height, _ in blocks)), dpi=DPI, facecolor="white")
+    is_compact = len(shown.maps) > 2
+    width = COMPACT if is_compact else WIDTH
+    blocks = _many(shown, scale, seen) if is_compact else _few(shown, scale, seen)
+    blocks = [_headline(subject, seen, is_compact), *blocks]
+    with rc_context(style.COMPACT if is_compact else style.STYLE):
+        figure = Figure(figsize=(width, sum(height for height, _ in blocks)), dpi=DPI, facecolor="white")
         parts = figure.subfigures(len(blocks), 1, height_ratios=[height for height, _ in blocks], squeeze=False)
         for part, (_, fill) in zip(parts[:, 0], blocks, strict=True):
             fill(part)
@@ -119,21 +129,29 @@ def _seen(subject: Subject) -> Seen:
     if is_cortex and folded.structure is None:
         folded = replace(folded, structure="Cortex")  # found once
     form = geometry.inflated(folded) if is_cortex else folded
-    values = subject.maps[0].values
-    assert values is not None
-    known = np.isfinite(values[source])
+    outwards = geometry.outwards(form) if is_cortex else 0.0
+    if outwards < -OUTWARDS:
+        folded, form = (replace(one, cells=one.cells[:, ::-1]) for one in (folded, form))
+    known, last = (np.isfinite(values_of(shown)[source]) for shown in (subject.maps[0], subject.maps[-1]))
     whole = known[folded.cells].all(1)
     area = geometry.area_vectors(form)[whole if whole.any() else slice(None)]
     views = sorted(geometry.views(folded), key=lambda view: -np.maximum(area @ view.camera[2], 0).sum())
     if subject.side is not None:
         views = [geometry.from_side(folded, subject.side), *(v for v in views if v.name != subject.side)][:4]
     sulci = geometry.curvature(folded) < 0 if is_cortex else np.zeros(len(source), bool)
-    return Seen(folded, form, source, sulci, known, views, is_cortex, chosen=subject.side is not None)
+    named = {view.name for view in (views if len(subject.maps) <= 2 else views[: subject.side is not None])}
+    by_position = named & {"lateral", "medial"} and folded.structure in (None, "Cortex")
+    return Seen(
+        folded, form, source, sulci, known, known | last, views, is_cortex,
+        chosen=subject.side is not None, plain_inside=abs(outwards) > OUTWARDS and geometry.is_open(folded),
+        position=geometry.hemisphere_by_position(folded) if by_position else None,
+    )  # fmt: skip
 
 
 def _few(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:
     """A run, or one or two maps: from four sides, in slices, and in figures."""
     words = [_words(subject.record)] if subject.record else []
+    figures = [_graphs(subject)] if _count(subject) else []
     if seen is None:
         line: list[Block] = [(3.4, lambda part: graphs.curve(part, subject))] if subject.is_curve else []
         beside_key = _beside(
@@ -142,13 +160,13 @@ def _few(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:
                 slices.height(subject, WIDTH - KEY),
                 lambda part: slices.draw(part, subject, scale),
             ),
-            (KEY, 0.0, lambda part: _key(part, subject, scale)),
+            (KEY, 0.0, lambda part: _key(part, subject, scale, seen)),
         )
-        return [*line, beside_key, _graphs(subject), *words]
+        return [*line, beside_key, *figures, *words]
     left = 0.6 * WIDTH
     cut = (left, slices.height(subject, left), lambda part: slices.draw(part, subject, scale))
     if seen.is_cortex:
-        below = [_beside(cut, (WIDTH - left, 0.0, lambda part: _folds(part, subject, scale, seen))), _graphs(subject)]
+        below = [_beside(cut, (WIDTH - left, 0.0, lambda part: _folds(part, subject, scale, seen))), *figures]
     else:
         below = [_beside(cut, (WIDTH - left, 0.0, lambda part: _fill_graphs(part, subject, columns=2)))]
     return [_views(subject, scale, seen), *below, *words]
@@ -193,19 +211,32 @@ def _views(subject: Subject, scale: Scale, seen: Seen) -> Block:
         for panel, axes in zip(panels, all_axes[0], strict=True):
             axes.set_title(panel.title, pad=15)
             surfaces.directions(axes, panel.view)
-        _key(right_part, subject, scale)
+        _key(right_part, subject, scale, seen)
 
     return rows * row + (rows - 1) * between + 0.7, fill
 
 
 def _paint(axes: Any, shown: Map, seen: Seen, scale: Scale, panel: Panel) -> None:
-    surfaces.draw(axes, seen.form, seen.colours(scale, shown), panel.view, seen.filled(shown), panel.box)
+    colours, filled = seen.colours(scale, shown), seen.filled(shown)
+    surfaces.draw(axes, seen.form, colours, panel.view, filled, panel.box, seen.plain_inside)
 
 
-def _key(part: Any, subject: Subject, scale: Scale) -> None:
-    missing = any(not np.isfinite(values_of(shown)).all() for shown in subject.maps)
-    filled = any(shown.filled is not None and bool(shown.filled.any()) for shown in subject.maps)
-    key.draw(part, scale, missing=missing, filled=filled)
+def _key(part: Any, subject: Subject, scale: Scale, seen: Seen | None) -> None:
+    key.draw(
+        part, scale if has_values(subject) else None, missing=_is_missing(subject), filled=_is_filled(subject, seen)
+    )
+
+
+def _is_missing(subject: Subject) -> bool:
+    return any(not np.isfinite(values_of(shown)).all() for shown in subject.maps)
+
+
+def _is_filled(subject: Subject, seen: Seen | None) -> bool:
+    """True where the sheet shows what was filled in."""
+    if seen is None:
+        return False
+    all_filled = (seen.filled(shown) for shown in subject.maps)
+    return any(filled is not None and geometry.is_filled(seen.folded, filled) for filled in all_filled)
 
 
 def _folds(part: Any, subject: Subject, scale: Scale, seen: Seen) -> None:
@@ -214,7 +245,7 @@ def _folds(part: Any, subject: Subject, scale: Scale, seen: Seen) -> None:
     all_axes = style.grid_of_axes(part, rows, 2, left=0.1, top=0.45, bottom=0.2, gap=(0.4, 0.2))
     for shown, line in zip(subject.maps, all_axes, strict=True):
         for view, axes in zip(seen.views, line, strict=False):
-            surfaces.draw(axes, seen.folded, seen.colours(scale, shown), view)
+            surfaces.draw(axes, seen.folded, seen.colours(scale, shown), view, plain_inside=seen.plain_inside)
     for view, axes in zip(seen.views, all_axes[0], strict=False):
         axes.set_title(view.name + ", folded", pad=15)
         surfaces.directions(axes, view)
@@ -224,14 +255,25 @@ def _graphs(subject: Subject) -> Block:
     return 2.1, lambda part: _fill_graphs(part, subject)
 
 
+def _count(subject: Subject) -> int:
+    """How many graphs there are of a run, or of one or two maps."""
+    return _histograms(subject) + graphs.courses(subject.record)
+
+
+def _histograms(subject: Subject) -> int:
+    return 1 + subject.compares if has_values(subject) else 0
+
+
 def _fill_graphs(part: Any, subject: Subject, columns: int | None = None) -> None:
     """Histograms, then the courses over the iterations, in rows of so many; by default in one."""
-    first = 2 if subject.compares else 1
-    count = first + graphs.courses(subject.record)
+    first, count = _histograms(subject), _count(subject)
+    if count == 0:
+        return
     columns = columns or max(count, 3)
     rows = -(-count // columns)
     axes = style.grid_of_axes(part, rows, columns, left=0.35, gap=(0.5, 0.6)).ravel()
-    graphs.draw_histograms(axes[:first], subject)
+    if first:
+        graphs.draw_histograms(axes[:first], subject)
     graphs.draw_iterations(axes[first:count], subject.record or {})
     for spare in axes[count:]:
         spare.set_axis_off()
@@ -239,7 +281,12 @@ def _fill_graphs(part: Any, subject: Subject, columns: int | None = None) -> Non
 
 def _words(record: Mapping[str, Any]) -> Block:
     """Warnings in full, and a table of the parameters that were used."""
-    used = [(name, _plain(value)) for name, value in (record.get("Parameters") or {}).items() if value is not None]
+    choice = record.get("Choice") or {}
+    parameters = {
+        name: choice.get(name, value) if value == "auto" else value
+        for name, value in (record.get("Parameters") or {}).items()
+    }
+    used = [(name, _plain(value)) for name, value in parameters.items() if value is not None]
     warnings = [line for one in record.get("Warnings") or [] for line in textwrap.wrap(f"Warning: {one}", 150)]
     columns = 6
     rows = -(-len(used) // columns)
@@ -268,26 +315,45 @@ def _plain(value: Any) -> str:
     return str(value)
 
 
-def _headline(subject: Subject, seen: Seen | None) -> Block:
+def _headline(subject: Subject, seen: Seen | None, is_compact: bool) -> Block:
     """The title, the figures that count, and small print."""
-    small = [*subject.notes]
-    if subject.channels > 1:
-        small.append(f"channel 1 of {subject.channels} is shown")
-    if seen is not None and seen.is_cortex:
-        small.append("inflated: a smoothed copy of the surface; without data, gyri are light and sulci dark")
-    if seen is not None and subject.mesh is not None and len(subject.mesh.cells) > len(seen.folded.cells):
-        small.append(f"drawn with {len(seen.folded.cells):,} of {len(subject.mesh.cells):,} triangles")
-    figures = headline(subject)
-    lines = [(subject.title, {"fontsize": 14, "fontweight": "bold"})] if subject.title else []
-    lines += [(figures, {"fontsize": 11})] if figures else []
-    lines += [(line, {"fontsize": 7.5, "color": FAINT}) for line in textwrap.wrap("; ".join(small), 190)]
-    height = 0.15 + 0.28 * len(lines)
+    figures, small = headline(subject), "; ".join(_small_print(subject, seen))
+    size, letters, line = (10, 105, 0.2) if is_compact else (7.5, 215, 0.16)  # points, a line, inches
+    lines: list[tuple[str, float, dict[str, Any]]] = []
+    lines += [(subject.title, 0.28, {"fontsize": 14, "fontweight": "bold"})] if subject.title else []
+    lines += [(figures, 0.28, {"fontsize": 11})] if figures else []
+    for k, words in enumerate(textwrap.wrap(small, letters)):
+        lines.append((words, line if k else 0.24, {"fontsize": size, "color": FAINT}))
+    height = 0.2 + sum(down for _, down, _ in lines)
 
     def fill(part: Any) -> None:
-        for k, (line, look) in enumerate(lines):
-            part.text(0.025, 1 - (0.3 + 0.27 * k) / height, line, **look)
+        y = 0.02
+        for words, down, look in lines:
+            y += down
+            part.text(0.025, 1 - y / height, words, **look)
 
     return height, fill
+
+
+def _small_print(subject: Subject, seen: Seen | None) -> list[str]:
+    """What is to be known of what is shown."""
+    small, record = [*subject.notes], subject.record or {}
+    if not has_values(subject.channel(0)):
+        small.append("no values")
+    if record.get("Iterations") == 0:
+        small.append("the flow changed nothing: what was removed is the extension to the surface alone")
+    if subject.channels > 1:
+        small.append(f"channel 1 of {subject.channels} is shown")
+    if seen is None or subject.mesh is None:
+        return small
+    if seen.position is not None:
+        small.append(f"taken for a {seen.position} hemisphere, by its position")
+    if seen.is_cortex:
+        grey = "; the inner side, where it is cut open, is pale" if seen.plain_inside else ""
+        small.append(f"inflated: a smoothed copy of the surface; without data, gyri are light and sulci dark{grey}")
+    if len(subject.mesh.cells) > len(seen.folded.cells):
+        small.append(f"drawn with {len(seen.folded.cells):,} of {len(subject.mesh.cells):,} triangles")
+    return small
 
 
 def headline(subject: Subject) -> str:
@@ -305,34 +371,48 @@ def headline(subject: Subject) -> str:
         parts.append(f"smoothness {smooth['before_mm']:.1f} → {smooth['after_mm']:.1f} mm FWHM")
     if record.get("Iterations") is not None:
         reason = f" (stop: {record['StopReason']})" if record.get("StopReason") else ""
-        parts.append(f"{record['Iterations']} iterations{reason}")
-    if record.get("Seconds"):
-        parts.append(f"{sum(record['Seconds'].values()):.1f} s")
+        parts.append(f"{record['Iterations']} iteration{'s' * (record['Iterations'] != 1)}{reason}")
+    seconds = [spent for what, spent in (record.get("Seconds") or {}).items() if what != "report" and spent is not None]
+    if seconds:
+        parts.append(f"denoised in {sum(seconds):.1f} s")
     return "   ·   ".join(parts)
 
 
 def _many(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:
-    """A figure as in a paper: a panel per map and one key."""
+    """A figure as in a paper: a panel per map and one key, in the place that they leave free or else beside them."""
     if subject.is_curve:
         return [(4.0, lambda part: graphs.curve(part, subject))]
     rows = -(-len(subject.maps) // 4)
     columns = -(-len(subject.maps) // rows)
     if seen is None:
-        return [(2.2 * len(subject.maps), lambda part: slices.draw(part, subject, scale))]
+        beside = COMPACT_KEY[scale.period]
+        cut = (
+            COMPACT - beside,
+            slices.height(subject, COMPACT - beside),
+            lambda part: slices.draw(part, subject, scale),
+        )
+        return [_beside(cut, (beside, key.height(scale, 1), lambda part: _key(part, subject, scale, seen)))]
     best = seen.views[0] if seen.chosen else geometry.best_view(seen.form, seen.known)
     panel = seen.close_up() or Panel(best.name, best, surfaces.whole(seen.form, best))
     across, up = np.ptp(panel.box, axis=0)
-    width = (WIDTH - KEY - 0.4 - 0.3 * (columns - 1)) / columns
+    free = rows * columns - len(subject.maps)
+    beside = 0.0 if free else COMPACT_KEY[scale.period or _is_filled(subject, seen)]
+    left, gap = COMPACT - beside, 0.15
+    width = (left - 0.4 - gap * (columns - 1)) / columns
     height = min(width * up / across, 4.0)
 
     def fill(part: Any) -> None:
-        left, right = part.subfigures(1, 2, width_ratios=[WIDTH - KEY, KEY])
-        all_axes = style.grid_of_axes(left, rows, columns, left=0.2, right=0.2, top=0.4, bottom=0.1, gap=(0.3, 0.4))
+        if free:
+            panels, place = part, part.add_subfigure(part.add_gridspec(rows, columns)[-1, -free:])
+        else:
+            panels, place = part.subfigures(1, 2, width_ratios=[left, beside])
+        all_axes = style.grid_of_axes(panels, rows, columns, left=0.2, right=0.2, top=0.4, bottom=0.1, gap=(gap, 0.4))
         for axes in all_axes.flat[len(subject.maps) :]:
             axes.set_axis_off()
         for shown, axes in zip(subject.maps, all_axes.flat, strict=False):
             _paint(axes, shown, seen, scale, panel)
-            axes.set_title(shown.title, fontsize=10)
-        _key(right, subject, scale)
+        style.set_titles(all_axes.flat, [shown.title for shown in subject.maps], width)
+        _key(place, subject, scale, seen)
 
-    return [(rows * height + (rows - 1) * 0.4 + 0.5, fill)]
+    of_key = key.height(scale, _is_missing(subject) + _is_filled(subject, seen)) * (rows if free else 1)
+    return [(max(rows * height + (rows - 1) * 0.4 + 0.5, of_key), fill)]

@@ -11,10 +11,13 @@ from beltrami_cli.grid import Grid
 from beltrami_cli.report import geometry
 from beltrami_cli.report.colours import Scale, difference_scale, scale_of
 from beltrami_cli.report.key import bar
-from beltrami_cli.report.style import DIRECTIONS, FAINT, cased, grid_of_axes, unit
+from beltrami_cli.report.style import DIRECTIONS, FAINT, cased, grid_of_axes, points, unit
 from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.surface import Mesh
 
+LETTERS = 0.35  # inches of a slice along an axis below which the ends of that axis are not named
+NARROW = 0.3  # of the widest column, the narrowest
+RIM = 0.1  # share of the slices at either end of a volume that say little: left out where any other cuts the data
 SLICES = ("sagittal", "coronal", "axial")
 
 
@@ -31,6 +34,11 @@ class Cuts:
         size = (self.box[1] - self.box[0] + 1) * self.grid.spacing
         first, second = np.delete(size, axis)
         return float(first), float(second)
+
+    def widths(self) -> list[float]:
+        """Of the columns, in mm: a narrow slice still has its title above it."""
+        across = [self.size(axis)[0] for axis in self.index]
+        return [max(width, NARROW * max(across)) for width in across]
 
     @property
     def is_plane(self) -> bool:
@@ -50,16 +58,18 @@ def draw(figure: Any, subject: Subject, scale: Scale | None = None) -> None:
         maps.append((subject.difference, subject.maps[0], subject.maps[-1], difference_scale(subject)))
     sizes = [cuts.size(axis) for axis in cuts.index]
     rows, columns = (1, len(maps)) if cuts.is_plane else (len(maps), len(sizes))
-    widths = [width for width, _ in sizes] * (columns if cuts.is_plane else 1)
+    widths = cuts.widths() * (columns if cuts.is_plane else 1)
     all_axes = grid_of_axes(
-        figure, rows, columns, left=0.5, right=0.9, bottom=0.2, top=0.45, gap=(0.35, 0.2), widths=widths
+        figure, rows, columns, left=0.5, right=0.9, bottom=0.2, top=0.5, gap=(0.35, 0.2), widths=widths
     )
     places = [(one, cut) for one in maps for cut in cuts.index.items()]
     for (one, (axis, index)), axes in zip(places, all_axes.flat, strict=True):
         _slice(axes, subject, cuts, axis, index, *one[1:])
+    size = points()
+    pad = 8 + size  # room for the letter
     for (title, *_), axes in zip(maps, all_axes[0] if cuts.is_plane else all_axes[:, 0], strict=True):
         if cuts.is_plane:
-            axes.set_title(title, pad=14)
+            axes.set_title(title, pad=pad, fontsize=size)
         else:
             axes.annotate(
                 title, (0, 0.5), (-16, 0), "axes fraction", "offset points", rotation=90, va="center", ha="right"
@@ -67,11 +77,13 @@ def draw(figure: Any, subject: Subject, scale: Scale | None = None) -> None:
     if not cuts.is_plane:
         for (axis, index), axes in zip(cuts.index.items(), all_axes[0], strict=True):
             at = cuts.grid.to_world(np.where(np.arange(3) == axis, index, cuts.box.mean(0))[None])[0, axis]
-            axes.set_title(f"{SLICES[axis]}, {'xyz'[axis]} = {at:.0f} mm", pad=14)
+            axes.set_title(f"{SLICES[axis]}, {'xyz'[axis]} = {at:.0f} mm", pad=pad, fontsize=size)
     for axes, (axis, _) in zip(all_axes[0], [cut for _, cut in places], strict=False):
         _letters(axes, axis)
     if subject.compares:
-        bar(all_axes[-1, -1].inset_axes((1.12, 0.1, 0.06, 0.8)), maps[-1][3], unit(subject.period))
+        last, inch = all_axes[-1, -1].get_position(original=True), figure.dpi / figure.bbox.width
+        place = (last.x1 + 0.28 * inch, last.y0 + 0.1 * last.height, 0.12 * inch, 0.8 * last.height)
+        bar(figure.add_axes(place), maps[-1][3], unit(subject.period))
 
 
 def height(subject: Subject, width: float) -> float:
@@ -79,9 +91,9 @@ def height(subject: Subject, width: float) -> float:
     cuts, maps = cuts_of(subject), len(subject.maps) + subject.compares
     sizes = [cuts.size(axis) for axis in cuts.index]
     columns, rows = (maps, 1) if cuts.is_plane else (len(sizes), maps)
-    across = sum(w for w, _ in sizes) * (maps if cuts.is_plane else 1)
+    across = sum(cuts.widths()) * (maps if cuts.is_plane else 1)
     scaled = (width - 1.4 - 0.35 * (columns - 1)) / across
-    return 0.65 + rows * min(scaled * max(h for _, h in sizes), 3.0) + 0.2 * (rows - 1)
+    return 0.7 + rows * min(scaled * max(h for _, h in sizes), 3.0) + 0.2 * (rows - 1)
 
 
 def cuts_of(subject: Subject) -> Cuts:
@@ -151,7 +163,13 @@ def _slice(
 def _letters(axes: Any, axis: int) -> None:
     """Where L, R, P, A, I, S are beside a slice."""
     first, second = (DIRECTIONS[k] for k in range(3) if k != axis)
+    size = np.ptp([axes.get_xlim(), axes.get_ylim()], axis=1)  # mm
+    cell, figure = axes.get_position(original=True), axes.figure
+    inches = np.array([cell.width * figure.bbox.width, cell.height * figure.bbox.height]) / figure.dpi
+    is_short = size * (inches / size).min() < LETTERS
     for (x, y), letter in zip(((-0.03, 0.5), (1.03, 0.5), (0.5, -0.03), (0.5, 1.03)), first + second, strict=True):
+        if is_short[int(x == 0.5)]:
+            continue
         align = {"ha": "right" if x < 0 else "left" if x > 1 else "center"}
         align["va"] = "top" if y < 0 else "bottom" if y > 1 else "center"
         axes.text(x, y, letter, transform=axes.transAxes, color=FAINT, fontsize="small", **align)
@@ -171,6 +189,9 @@ def _where_to_cut(subject: Subject, grid: Grid) -> dict[int, int]:
     for axis in range(3):
         inside = np.clip(at[:, axis], 0, shape[axis] - 1).astype(int)
         counts = np.bincount(inside, minlength=shape[axis])
+        rim = max(1, round(shape[axis] * RIM))
+        if counts[rim:-rim].any():
+            counts[:rim] = counts[-rim:] = 0
         many = np.flatnonzero(counts >= counts.max() / 2)
         middle[axis] = int(many[np.argmin(np.abs(many - np.median(inside)))])
     return middle

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,16 @@ STYLE = {
     "svg.fonttype": "none",
 }
 
+# Of a figure that is 8 inches wide: a web page shows it at 736 pixels, 61 % of its 150 dots per inch.
+COMPACT = (
+    STYLE
+    | {"font.size": 11, "axes.titlesize": 13, "axes.labelsize": 11, "legend.fontsize": 11}
+    | {
+        "xtick.labelsize": 11,
+        "ytick.labelsize": 11,
+    }
+)
+
 DIRECTIONS = (("L", "R"), ("P", "A"), ("I", "S"))  # the ends of the axes of RAS
 
 
@@ -42,6 +52,10 @@ def unit(period: float | None) -> str:
     if period is None:
         return ""
     return "°" if period == 360 else " rad" if abs(period - 2 * np.pi) < 1e-3 else ""
+
+
+LEAST = 8.0  # points, of a title
+HANDLE = 0.3  # inches, of a line in a legend with the space around it
 
 
 def cased(axes: Any, segments: np.ndarray, width: float = 0.7, colour: str = "black") -> None:
@@ -82,3 +96,57 @@ def grid_of_axes(
         width_ratios=widths,
     )
     return layout.subplots(squeeze=False)
+
+
+def legend_above(axes: Any, handles: Sequence[Any], title: str = "") -> None:
+    """A legend between the title and axes that give way to it, in as few rows as the names need."""
+    size = points("legend.fontsize")
+    box, figure = axes.get_position(), axes.figure
+    across, up = box.width * figure.bbox.width / figure.dpi, figure.bbox.height / figure.dpi
+    names = [fitted(str(handle.get_label()), across - HANDLE, size) for handle in handles]
+    widths = [_width(name, size) + HANDLE for name in names]
+    columns = len(names)
+    while columns > 1 and sum(max(widths[k::columns]) for k in range(columns)) > across:
+        columns -= 1
+    rows = -(-len(names) // columns)
+    line = 1.5 * size / 72  # inches
+    axes.set_position((box.x0, box.y0, box.width, box.height - rows * line / up))
+    axes.legend(
+        _by_rows(handles, columns), _by_rows(names, columns), loc="lower left", bbox_to_anchor=(0.0, 1.0),
+        ncols=columns, frameon=False, borderpad=0, borderaxespad=0.2, labelspacing=0.3, handlelength=1.4,
+        handletextpad=0.4, columnspacing=1.0,
+    )  # fmt: skip
+    axes.set_title(title, pad=rows * line * 72 + 6)
+
+
+def _by_rows(items: Sequence[Any], columns: int) -> list[Any]:
+    """In the order that a legend, which fills its columns one by one, shows row by row."""
+    return [item for k in range(columns) for item in items[k::columns]]
+
+
+def _width(text: str, size: float) -> float:
+    """About how wide, in inches; size in points."""
+    return 0.56 * size / 72 * len(text)
+
+
+def fitted(text: str, width: float, size: float) -> str:
+    """Text cut in its middle to about a width in inches."""
+    most = max(6, int(width / _width("x", size)))
+    return text if len(text) <= most else f"{text[: most // 2]}\u2026{text[-(most - most // 2 - 1) :]}"
+
+
+def set_titles(all_axes: Iterable[Any], titles: Sequence[str], width: float) -> None:
+    """Titles in letters of one size that fit into a width in inches; what is too long even for the least is cut."""
+    most = points("axes.titlesize")
+    size = min(most, *(most * width / _width(title or "x", most) for title in titles))
+    size = max(size, LEAST)
+    for axes, title in zip(all_axes, titles, strict=False):
+        axes.set_title(fitted(title, 1.05 * width, size), fontsize=size)
+
+
+def points(name: str = "font.size") -> float:
+    """A type size among matplotlib's parameters, in points."""
+    from matplotlib import rcParams
+    from matplotlib.font_manager import FontProperties
+
+    return float(FontProperties(size=rcParams[name]).get_size_in_points())

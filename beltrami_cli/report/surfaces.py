@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from beltrami_cli.report import geometry
-from beltrami_cli.report.colours import FILLED
+from beltrami_cli.report.colours import FILLED, INNER
 from beltrami_cli.report.geometry import View
 from beltrami_cli.report.style import DIRECTIONS, FAINT, cased
 from beltrami_cli.surface import Mesh
@@ -22,24 +22,30 @@ def draw(
     view: View,
     filled: np.ndarray | None = None,
     box: np.ndarray | None = None,
+    plain_inside: bool = False,
 ) -> None:
     """The surface from one side, lit from the camera, in parallel projection; the nearest triangles last.
 
     colours: (V, 4), blending from vertex to vertex. filled: (V,) bool, places to be outlined. box: (2, 2) from and to,
-    right and up in mm: the part to be shown; by default all.
+    right and up in mm: the part to be shown; by default all. plain_inside: where the surface is cut open, its inner
+    side has no data's colours, which would seem to lie on what is before it.
     """
     from matplotlib.collections import TriMesh
     from matplotlib.tri import Triangulation
 
-    across, up, depth = view.camera @ mesh.vertices_ras_mm.T
+    points, cells, lit = mesh.vertices_ras_mm @ view.camera.T, mesh.cells, colours.copy()
+    if plain_inside:
+        # Triangles that turn away get vertices of their own.
+        away = geometry.area_vectors(mesh) @ view.camera[2] < 0
+        cells = np.where(away[:, None], cells + len(points), cells)
+        points, lit = np.concatenate([points, points]), np.concatenate([lit, np.broadcast_to((*INNER, 1), lit.shape)])
     facing = np.abs(geometry.vertex_normals(mesh) @ view.camera[2])
-    lit = colours.copy()
-    lit[:, :3] *= (AMBIENT + (1 - AMBIENT) * facing)[:, None]
+    lit[:, :3] *= np.resize(AMBIENT + (1 - AMBIENT) * facing, (len(points), 1))
     box = whole(mesh, view) if box is None else box
-    corners = np.stack([across, up], -1)[mesh.cells]
-    cells = mesh.cells[((corners.max(1) >= box[0]) & (corners.min(1) <= box[1])).all(1)]
-    farthest_first = np.argsort(depth[cells].mean(1))
-    painted = TriMesh(Triangulation(across, up, cells[farthest_first]))
+    corners = points[cells, :2]
+    cells = cells[((corners.max(1) >= box[0]) & (corners.min(1) <= box[1])).all(1)]
+    farthest_first = np.argsort(points[cells, 2].mean(1))
+    painted = TriMesh(Triangulation(points[:, 0], points[:, 1], cells[farthest_first]))
     painted.set_facecolor(lit)
     # Its limits are known; matplotlib would look for them triangle by triangle, which takes longer than to paint.
     axes.add_collection(painted, autolim=False)
