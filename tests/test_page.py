@@ -15,7 +15,7 @@ from browser import RECORD, angles, sphere
 
 from beltrami_cli.errors import DataError
 from beltrami_cli.grid import Grid
-from beltrami_cli.report import index, page
+from beltrami_cli.report import index, page, words
 from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.surface import Mesh
 
@@ -149,15 +149,15 @@ def test_a_page_without_a_title_has_no_empty_heading(titles, named, monkeypatch)
 
 @pytest.mark.parametrize(("period", "of"), [(360.0, "°"), (2 * np.pi, " rad"), (24.0, ""), (None, "")])
 def test_angles_have_their_unit(period, of):
-    said = dict(page.facts(RECORD, period))
+    said = dict(words.facts(RECORD, period))
     assert said["Noise"] == f"39.9{of} → 0.593{of}"
-    assert said["Removed (rms)"] == f"40.5{of}"
+    assert said["Removed (rms, voxels)"] == f"40.5{of}"
     assert said["Smoothness (FWHM)"] == "1.02 → 11.8 mm"
 
 
 def test_the_time_leaves_out_the_picture():
-    assert dict(page.facts({"Seconds": {"read": 0.25, "flow": 3.75, "report": 9.0}}))["Denoised in"] == "4.0 s"
-    assert "Denoised in" not in dict(page.facts({"Seconds": {}}))
+    assert dict(words.facts({"Seconds": {"read": 0.25, "flow": 3.75, "report": 9.0}}))["Denoised in"] == "4.0 s"
+    assert "Denoised in" not in dict(words.facts({"Seconds": {}}))
 
 
 def test_a_flow_without_iterations_is_explained():
@@ -171,16 +171,16 @@ def test_a_flow_without_iterations_is_explained():
 
 def test_parameters_that_are_not_set_take_one_line():
     record = {"Parameters": {"phi": None, "beta": 0.5, "edge": None, "seed": 0}}
-    (table,) = page.tables(record)
+    (table,) = words.tables(record)
     assert table.rows == [("beta", "0.5"), ("seed", "0"), ("not set", "phi, edge")]
 
 
 def test_a_beta_that_was_chosen_is_said():
     record = {"Parameters": {"flow": "beltrami", "beta": "auto"}, "Choice": {"beta": 0.03333}}
-    assert dict(page.facts(record))["Flow"] == "beltrami, beta 0.0333"
-    assert next(page.tables(record)).rows[1] == ("beta", "0.03333 (auto)")
+    assert dict(words.facts(record))["Flow"] == "beltrami, beta 0.0333"
+    assert next(words.tables(record)).rows[1] == ("beta", "0.03333 (auto)")
     unknown = {"Parameters": {"flow": "beltrami", "beta": "auto"}, "Choice": {"beta": None}}
-    assert dict(page.facts(unknown))["Flow"] == "beltrami, beta auto"
+    assert dict(words.facts(unknown))["Flow"] == "beltrami, beta auto"
 
 
 def test_a_surface_without_any_value_says_so():

@@ -218,7 +218,7 @@ def test_slices_show_values_where_they_are(tmp_path):
     volume = np.full(grid.shape, np.nan)
     volume[5, 10:, :] = 1.0
     figure = Figure(figsize=(9, 4))
-    subject = Subject("s", (Map("a", None, volume),), None, grid)
+    subject = Subject("s", (Map("map", None, volume),), None, grid)
     slices.draw(figure, subject, Scale(0, 1))
     sagittal, coronal, axial = figure.axes
     assert [axes.get_title() for axes in figure.axes] == [
@@ -336,10 +336,14 @@ def test_a_lobe_of_angles_around_0_is_not_split():
     assert axes.get_xticks() == pytest.approx([0, 90, 180, -90])
 
 
+def over_iterations(figure: Figure, record: dict) -> None:
+    graphs.draw_iterations(style.grid_of_axes(figure, 1, graphs.courses(record))[0], record)
+
+
 def test_courses_over_the_iterations():
     figure = Figure(figsize=(10, 2))
-    assert graphs.has_iterations(RECORD) and graphs.courses(RECORD) == 5
-    graphs.iterations(figure, RECORD)
+    assert graphs.courses(RECORD) == 5
+    over_iterations(figure, RECORD)
     at = {axes.get_title(): axes for axes in figure.axes}
     assert list(at) == [
         "change, rms",
@@ -362,7 +366,7 @@ def test_the_noise_of_the_data_is_drawn_on_one_scale_with_what_is_left():
     noise = [{"iteration": k, "sd": [sd]} for k, sd in enumerate((7.0, 1.0, 0.6))]
     figure = Figure(figsize=(3, 2))
     record = {"Noise": {"sd": [39.9], "after": [0.6]}, "PerIteration": {"noise_sd": noise}}
-    graphs.iterations(figure, record | {"Parameters": {"period": 360.0}})
+    over_iterations(figure, record | {"Parameters": {"period": 360.0}})
     (axes,) = figure.axes
     assert axes.get_yscale() == "log" and axes.get_ylim()[1] > 39.9  # 7 to 0.6 alone would be linear
     assert axes.texts[0].get_text() == "data: 39.9°"
@@ -382,7 +386,7 @@ def test_the_noise_of_the_data_is_drawn_on_one_scale_with_what_is_left():
 )
 def test_courses_of_records_that_lack_something(record, expected):
     assert graphs.courses(record) == expected
-    assert graphs.has_iterations(record) == bool(expected)
+    assert bool(graphs.courses(record)) == bool(expected)
 
 
 @pytest.mark.parametrize(
@@ -472,7 +476,7 @@ def test_a_run_that_changed_nothing(tmp_path, monkeypatch):
         "PerIteration": {"beta": [], "change_rms": [], "noise_sd": [{"iteration": 0, "sd": [2.0]}]},
     }
     text = words(run_on(box(), record=record), tmp_path, monkeypatch)
-    assert "0 iterations" in text and "the flow changed nothing" in text
+    assert "iterations\xa00" in text and "The flow changed nothing" in text
     assert text.split("\n").count("auto") == 1 and "0.125" in text  # stop: auto
     assert "noise on the surface" not in text and "held-out error, rms" in text
 
@@ -514,8 +518,9 @@ def test_close_by_what_was_filled_in_is_shown_too():
 
 def test_the_words_of_a_run(tmp_path, monkeypatch):
     text = words(run_on(replace(box(), structure="CortexLeft"), SPACE, notes=("a note",)), tmp_path, monkeypatch)
-    assert "noise 2 → 0.5   ·   removed 1.5 rms   ·   smoothness 1.0 → 4.0 mm FWHM" in text
-    assert "2 iterations (stop: iterations)   ·   denoised in 3.0 s" in text
+    plain = text.replace("\xa0", " ").replace("\n", " ")
+    assert "noise 2 → 0.5  ·  removed (rms, voxels) 1.5  ·  smoothness (FWHM) 1 → 4 mm" in plain
+    assert "iterations 2  ·  stopped by iterations" in plain and "denoised in 3.0 s" in plain
     assert "Warning: the first\nWarning: the second" in text
     for expected in (
         "a note",
@@ -593,3 +598,78 @@ def test_no_global_state_of_matplotlib_is_touched(tmp_path):
 
 def test_shades_of_lines_stay_apart():
     assert len({to_rgb(colour) for colour in style.LINES}) == len(style.LINES) >= 6
+
+
+# What slices say of space
+
+
+def letters_of(affine: np.ndarray, shape: tuple[int, int, int], **changes: object) -> list[list[str]]:
+    """The letters beside each slice of the first row: left, right, below, above."""
+    grid = Grid(shape, affine)
+    figure = Figure(figsize=(9, 3))
+    volume = np.random.default_rng(0).normal(size=shape)
+    slices.draw(figure, replace(Subject("s", (Map("map", None, volume),), None, grid), **changes))
+    return [[text.get_text() for text in axes.texts if len(text.get_text()) == 1] for axes in figure.axes]
+
+
+def test_the_letters_of_slices_and_of_planes():
+    assert letters_of(np.eye(4), (20, 20, 20)) == [["P", "A", "I", "S"], ["L", "R", "I", "S"], ["L", "R", "P", "A"]]
+    # A coronal plane, whose third axis runs to posterior, and a sagittal one.
+    coronal, sagittal = np.eye(4)[[0, 2, 1, 3]], np.eye(4)[[2, 0, 1, 3]]
+    assert letters_of(coronal, (20, 20, 1)) == [["L", "R", "I", "S"]]
+    assert letters_of(sagittal, (20, 20, 1)) == [["P", "A", "I", "S"]]
+    assert letters_of(np.eye(4), (20, 20, 1), has_anatomy=False) == [[]]
+
+
+@pytest.mark.parametrize("rows_down", [True, False])
+def test_a_picture_stands_upright(tmp_path, rows_down):
+    values = np.zeros((30, 20, 1))
+    values[:10] = 1.0  # the first rows of a picture
+    subject = Subject("s", (Map("a", None, values),), None, Grid((30, 20, 1), np.eye(4)), rows_down=rows_down)
+    figure = Figure(figsize=(4, 4))
+    slices.draw(figure, subject, Scale(0.0, 1.0))
+    rows, columns = np.nonzero((np.abs(saved(tmp_path, figure) - Scale(0, 1).rgba([1.0])[0, :3]) < 0.02).all(-1))
+    others = np.nonzero((np.abs(saved(tmp_path, figure) - Scale(0, 1).rgba([0.0])[0, :3]) < 0.02).all(-1))
+    if rows_down:
+        assert rows.max() <= others[0].min() and np.ptp(columns) == pytest.approx(2 * np.ptp(rows), rel=0.1)
+    else:
+        assert columns.max() <= others[1].min()
+
+
+def test_an_oblique_slice_says_about_where_it_is():
+    turned = np.eye(4)
+    turned[:2, :2] = [[0.9, -0.436], [0.436, 0.9]]
+    cuts = slices.cuts_of(Subject("s", (Map("a", None, np.ones((20, 20, 20))),), None, Grid((20, 20, 20), turned)))
+    assert "≈" in cuts.title(0) and "=" in cuts.title(2)
+
+
+def test_names_of_files_are_no_mathematics(tmp_path):
+    mesh = box()
+    values = np.arange(float(len(mesh.vertices_ras_mm)))
+    maps = tuple(Map(name, values) for name in ("$a^{$", "_under", "bad\udcff"))
+    for count in (2, 3):
+        sheet.draw(tmp_path / f"{count}.png", Subject("$x_{", maps[-count:], mesh))
+        assert (tmp_path / f"{count}.png").stat().st_size > 10_000
+
+
+def test_a_failure_of_drawing_is_not_told_as_a_full_disk(tmp_path, monkeypatch):
+    def fail(*_: object, **__: object) -> None:
+        raise ValueError("cannot draw")
+
+    monkeypatch.setattr(Figure, "savefig", fail)
+    with pytest.raises(ValueError, match="cannot draw"):
+        sheet.draw(tmp_path / "s.png", run_on(box()))
+    assert not (tmp_path / "s.png").exists()
+
+
+def test_labels_of_the_bar_tell_large_values_apart():
+    figure = Figure(figsize=(2, 4))
+    key.draw(figure, Scale(15_000.0, 15_030.0))
+    figure.canvas.draw()
+    labels = [tick.get_text() for tick in figure.axes[0].get_yticklabels() if tick.get_text()]
+    assert len(set(labels)) == len(labels) > 3
+
+
+def test_colours_of_values_near_the_ends_of_floats():
+    colours = Scale(-1.5e308, 1.5e308).rgba(np.array([-1.5e308, 0.0, 1.5e308, np.nan]))
+    assert np.allclose(colours[[0, 2], :3], Scale(0, 1).rgba(np.array([0.0, 1.0]))[:, :3])

@@ -55,7 +55,9 @@ class Scale:
         """(N, 4) colours of values (N,), from 0 to 1; MISSING where they are not finite."""
         values = np.asarray(values, float)
         known = np.isfinite(values)
-        share = (np.where(known, values, self.low) - self.low) / (self.high - self.low)
+        # Halves, whose differences are finite whatever the values.
+        low, high = self.low / 2, self.high / 2
+        share = (np.where(known, values / 2, low) - low) / (high - low)
         steps = np.floor((share % 1 if self.period else np.clip(share, 0, 1)) * 256)
         colours = np.ones((len(values), 4))
         colours[:, :3] = np.where(

@@ -145,20 +145,11 @@ def _places(subject: Subject) -> str:
     return "voxels" if subject.maps[0].values is None else "vertices"
 
 
-def has_iterations(record: Mapping[str, Any] | None) -> bool:
-    """True where `iterations` has something to draw."""
-    return bool(_courses(record))
-
-
-def iterations(figure: Any, record: Mapping[str, Any], period: float | None = None) -> None:
-    """One axes for each course that the record holds over the iterations: change, noise, held-out error, beta."""
-    count = len(_courses(record))
-    if count:
-        draw_iterations(grid_of_axes(figure, 1, count, gap=(0.5, 0))[0], record)
-
-
 def draw_iterations(all_axes: np.ndarray, record: Mapping[str, Any]) -> None:
-    """The same on axes that are there, as many as `courses` counts."""
+    """Each course that the record holds over the iterations (change, noise, held-out error, beta) on axes of its own.
+
+    all_axes: as many as `courses` counts.
+    """
     for axes, course in zip(all_axes, _courses(record), strict=False):
         x, y = course.x, course.y
         axes.plot(x, y, color=DENOISED, linewidth=1.4, marker="o", markersize=3 if len(x) < 40 else 0)
@@ -199,7 +190,7 @@ def _to_log(axes: Any, values: np.ndarray) -> None:
 
 
 def courses(record: Mapping[str, Any] | None) -> int:
-    """How many axes `iterations` draws."""
+    """How many axes `draw_iterations` fills."""
     return len(_courses(record))
 
 

@@ -58,7 +58,7 @@ def bar(axes: Any, scale: Scale, of: str = "") -> None:
     axes.imshow(scale.table()[:, None], origin="lower", aspect="auto", extent=(0, 1, scale.low, scale.high))
     axes.set_xticks([])
     axes.yaxis.tick_right()
-    axes.yaxis.set_major_formatter(f"{{x:g}}{of}")
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:.10g}{of}")  # also of large values that differ little
     axes.spines[:].set_visible(False)
 
 

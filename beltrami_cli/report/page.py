@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import base64
 import io
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from beltrami_cli.formats import checks
-from beltrami_cli.report import colours, geometry, graphs, key, slices, style
+from beltrami_cli.report import colours, geometry, graphs, key, slices, style, words
 from beltrami_cli.report.colours import Scale
 from beltrami_cli.report.subject import Subject
 from beltrami_cli.surface import Mesh
@@ -49,15 +48,6 @@ class Picture:
     channel: int | None = None
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of text. heading: what it is of. columns: none for pairs of a name and a value."""
-
-    heading: str
-    rows: Sequence[Sequence[str]]
-    columns: Sequence[str] = ()
-
-
 def write(path: Path, subject: Subject) -> None:
     """Write a page (HTML) that shows a subject, whatever the path's suffix.
 
@@ -79,24 +69,23 @@ def page(subject: Subject) -> str:
     scene, notes = _scene(subject, channels) if has_scene else (None, [])
     if channels < subject.channels:
         notes.append(f"Shown: the first {channels} of {subject.channels:,} channels.")
-    if not any(_has_values(subject.channel(k)) for k in range(channels)):
+    if not any(colours.has_values(subject.channel(k)) for k in range(channels)):
         notes.append("No values.")
     if record.get("Iterations") == 0:
-        extended = "" if subject.maps[0].volume is None else ": what was removed is the extension to the surface alone"
-        notes.append(f"The flow changed nothing{extended}.")
+        notes.append(words.NOTHING if subject.maps[0].volume is None else words.EXTENSION_ALONE)
     return fill(
         "page.html",
         title=subject.title,
         name=subject.title or ", ".join(shown.title for shown in subject.maps if shown.title) or "Maps",
-        facts=facts(record, subject.period),
+        facts=words.facts(record, subject.period),
         warnings=[str(line) for line in record.get("Warnings") or ()],
         notes=[*subject.notes, *notes],
         channels=channels,
         scene=scene,
         plotly=_plotly() if has_scene else None,
         pictures=list(_pictures(subject, channels)),
-        tables=list(tables(record)),
-        version=_version(record),
+        tables=list(words.tables(record)),
+        version=words.version(record),
     )
 
 
@@ -155,6 +144,9 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
     is_cortex = geometry.is_cortex(whole)
     if is_cortex and whole.structure is None:
         whole = replace(whole, structure="Cortex")  # found once
+    position = geometry.hemisphere_by_position(whole) if is_cortex else None
+    if position is not None:
+        notes.append(f"3-D: taken for a {position} hemisphere, by its position.")
     # The inflated one first: folds hide data in their sulci.
     forms = {"inflated": geometry.inflated(mesh), "folded": mesh} if is_cortex else {"surface": mesh}
     of_channels = [subject.channel(k) for k in range(channels)]
@@ -174,7 +166,7 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
             for shown in maps
         ],
         "scales": [
-            {"low": scale.low, "high": scale.high, "cyclic": scale.period} if _has_values(one) else None
+            {"low": scale.low, "high": scale.high, "cyclic": scale.period} if colours.has_values(one) else None
             for scale, one in zip(scales, of_channels, strict=True)
         ],
         "unit": style.unit(subject.period),
@@ -191,10 +183,6 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
 
 def _view(view: geometry.View) -> dict[str, Any]:
     return {"name": view.name, "camera": view.camera.tolist()}
-
-
-def _has_values(subject: Subject) -> bool:
-    return any(bool(np.isfinite(colours.values_of(shown)).any()) for shown in subject.maps)
 
 
 def _of_channel(values: np.ndarray | None, k: int) -> np.ndarray:
@@ -240,7 +228,7 @@ def _pictures(subject: Subject, channels: int) -> Iterator[Picture]:
     titles = ", ".join(shown.title for shown in subject.maps)
     for k in range(channels):
         one = subject.channel(k)
-        if not _has_values(one):
+        if not colours.has_values(one):
             continue
         of = k if channels > 1 else None
         scale = colours.scale_of(one)
@@ -286,125 +274,3 @@ def _drawn(draw: Callable[..., None], height: float, *what: Any) -> str:
         file = io.BytesIO()
         figure.savefig(file, format="svg", dpi=RASTER_DPI, metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(file.getvalue()).decode("ascii")
-
-
-# The record in words
-
-
-def facts(record: Mapping[str, Any], period: float | None = None) -> list[tuple[str, str]]:
-    """What a run did, in pairs of a name and a value; what the record lacks is left out. period: of angles."""
-    noise, removed, smoothness, used = (
-        record.get(key) or {} for key in ("Noise", "Removed", "Smoothness", "Parameters")
-    )
-    flow = " ".join(str(used[key]) for key in ("flow", "phi") if used.get(key) is not None)
-    of = style.unit(period)
-    beta = _chosen_beta(record) or used.get("beta")
-    seconds = [
-        spent for phase, spent in (record.get("Seconds") or {}).items() if phase != "report" and spent is not None
-    ]
-    found = {
-        "Noise": _change(_together(noise.get("sd"), of), _together(noise.get("after"), of)),
-        "Removed (rms)": _figure(removed.get("rms"), of),
-        "Smoothness (FWHM)": _change(_figure(smoothness.get("before_mm")), _figure(smoothness.get("after_mm"), " mm")),
-        "Iterations": _figure(record.get("Iterations")),
-        "Stopped by": str(record.get("StopReason") or ""),
-        "Flow": flow + (f", beta {_figure(beta)}" if beta is not None else ""),
-        "Denoised in": f"{sum(seconds):,.1f} s" if seconds else "",
-    }
-    return [(name, value) for name, value in found.items() if value]
-
-
-def _chosen_beta(record: Mapping[str, Any]) -> float | None:
-    """What "auto" came to; None where beta was given, or where nothing was found."""
-    asked, choice = record.get("Parameters") or {}, record.get("Choice") or {}
-    return choice.get("beta") if str(asked.get("beta")).startswith("auto") else None
-
-
-def _change(before: str, after: str) -> str:
-    return f"{before or '?'} → {after or '?'}" if before or after else ""
-
-
-def _together(per_channel: Sequence[float | None] | None, unit: str) -> str:
-    """The root of the mean square of the known ones."""
-    known = [sd for sd in per_channel or () if sd is not None]
-    return _figure(math.sqrt(sum(sd * sd for sd in known) / len(known)), unit) if known else ""
-
-
-def _figure(value: Any, unit: str = "") -> str:
-    """A number to three digits, whole ones in full; other things as they are; nothing for None."""
-    if value is None:
-        return ""
-    return (f"{value:.3g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)) + unit
-
-
-NONE = "–"
-# Shown elsewhere on the page, or drawn.
-_APART = ("Parameters", "Sources", "Outputs", "Warnings", "Seconds", "Choice", "PerIteration", "GeneratedBy", "Request")
-
-
-def tables(record: Mapping[str, Any]) -> Iterator[Table]:
-    """Everything that the record says, but what goes on for as long as the iterations."""
-    if record.get("Parameters"):
-        beta = _chosen_beta(record)
-        used = record["Parameters"] if beta is None else {**record["Parameters"], "beta": f"{_text(beta)} (auto)"}
-        yield Table("Parameters", _pairs(used))
-    choice = record.get("Choice") or {}
-    if choice.get("table"):
-        columns = list(dict.fromkeys(key for row in choice["table"] for key in row))
-        rows = [[_text(row.get(key)) for key in columns] for row in choice["table"]]
-        yield Table("Automatic choice: what was tried", rows, [_spelt(key) for key in columns])
-    chosen = {key: value for key, value in choice.items() if key not in ("table", "errors")}
-    if chosen:
-        yield Table("Automatic choice", _pairs(chosen))
-    if record.get("Sources"):
-        rows = [[_text(source.get(key)) for key in ("Role", "Path", "SHA256")] for source in record["Sources"]]
-        yield Table("Sources", rows, ["Role", "Path", "SHA-256"])
-    if record.get("Outputs"):
-        yield Table("Outputs", [[_text(file)] for file in record["Outputs"]], ["Path"])
-    if record.get("Seconds"):
-        yield Table("Seconds", _pairs(record["Seconds"]))
-    rest = {key: value for key, value in record.items() if key not in _APART}
-    if rest:
-        yield Table("Further figures", _pairs(rest))
-
-
-def _pairs(record: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Pairs of a name and a value; the names of those without a value in one line, the last."""
-    found = list(_flat(record))
-    unset = ", ".join(name for name, value in found if value == NONE)
-    return [(name, value) for name, value in found if value != NONE] + ([("not set", unset)] if unset else [])
-
-
-def _flat(record: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Pairs of a name and a value, those of records within it too."""
-    for field, value in record.items():
-        name = f"{above}: {_spelt(field)}" if above else _spelt(field)
-        if isinstance(value, Mapping):
-            yield from _flat(value, name)
-        else:
-            yield name, _text(value)
-
-
-def _spelt(key: object) -> str:
-    return str(key).replace("_", " ")
-
-
-def _text(value: Any) -> str:
-    """A value as a reader expects it, numbers to six digits."""
-    if value is None:
-        return NONE
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, (list, tuple)):
-        return ", ".join(f"({_text(each)})" if isinstance(each, (list, tuple)) else _text(each) for each in value)
-    if isinstance(value, Mapping):
-        return ", ".join(f"{_spelt(key)} {_text(each)}" for key, each in value.items())
-    return str(value)
-
-
-def _version(record: Mapping[str, Any]) -> str:
-    """Which programs made it, and when, as the record says."""
-    by = [f"{each.get('Name', '?')} {each.get('Version', '')}".strip() for each in record.get("GeneratedBy") or ()]
-    return ", ".join([*by, *([str(record["Created"])] if record.get("Created") else [])])

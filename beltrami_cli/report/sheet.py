@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -11,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from beltrami_cli.formats import checks
-from beltrami_cli.report import geometry, graphs, key, slices, style, surfaces
+from beltrami_cli.report import geometry, graphs, key, slices, style, surfaces, words
 from beltrami_cli.report.colours import MISSING_SULCUS, Scale, faded, has_values, scale_of, values_of
 from beltrami_cli.report.geometry import View
-from beltrami_cli.report.style import FAINT, unit
+from beltrami_cli.report.style import FAINT
 from beltrami_cli.report.subject import Map, Subject
 from beltrami_cli.surface import Mesh
 
@@ -118,8 +119,10 @@ def draw(path: Path, subject: Subject) -> None:
         parts = figure.subfigures(len(blocks), 1, height_ratios=[height for height, _ in blocks], squeeze=False)
         for part, (_, fill) in zip(parts[:, 0], blocks, strict=True):
             fill(part)
-        with checks.writing(path):
-            figure.savefig(path, format="png", dpi=DPI)
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format="png", dpi=DPI)
+    with checks.writing(path):
+        path.write_bytes(drawn.getvalue())
 
 
 def _seen(subject: Subject) -> Seen:
@@ -150,7 +153,7 @@ def _seen(subject: Subject) -> Seen:
 
 def _few(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:
     """A run, or one or two maps: from four sides, in slices, and in figures."""
-    words = [_words(subject.record)] if subject.record else []
+    told = [_words(subject.record)] if subject.record else []
     figures = [_graphs(subject)] if _count(subject) else []
     if seen is None:
         line: list[Block] = [(3.4, lambda part: graphs.curve(part, subject))] if subject.is_curve else []
@@ -162,14 +165,14 @@ def _few(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:
             ),
             (KEY, 0.0, lambda part: _key(part, subject, scale, seen)),
         )
-        return [*line, beside_key, *figures, *words]
+        return [*line, beside_key, *figures, *told]
     left = 0.6 * WIDTH
     cut = (left, slices.height(subject, left), lambda part: slices.draw(part, subject, scale))
     if seen.is_cortex:
         below = [_beside(cut, (WIDTH - left, 0.0, lambda part: _folds(part, subject, scale, seen))), *figures]
     else:
         below = [_beside(cut, (WIDTH - left, 0.0, lambda part: _fill_graphs(part, subject, columns=2)))]
-    return [_views(subject, scale, seen), *below, *words]
+    return [_views(subject, scale, seen), *below, *told]
 
 
 def _beside(*parts: tuple[float, float, Callable[[Any], None]]) -> Block:
@@ -281,11 +284,9 @@ def _fill_graphs(part: Any, subject: Subject, columns: int | None = None) -> Non
 
 def _words(record: Mapping[str, Any]) -> Block:
     """Warnings in full, and a table of the parameters that were used."""
-    choice = record.get("Choice") or {}
-    parameters = {
-        name: choice.get(name, value) if value == "auto" else value
-        for name, value in (record.get("Parameters") or {}).items()
-    }
+    parameters = dict(record.get("Parameters") or {})
+    if (beta := words.chosen_beta(record)) is not None:
+        parameters["beta"] = beta
     used = [(name, _plain(value)) for name, value in parameters.items() if value is not None]
     warnings = [line for one in record.get("Warnings") or [] for line in textwrap.wrap(f"Warning: {one}", 150)]
     columns = 6
@@ -317,22 +318,29 @@ def _plain(value: Any) -> str:
 
 def _headline(subject: Subject, seen: Seen | None, is_compact: bool) -> Block:
     """The title, the figures that count, and small print."""
-    figures, small = headline(subject), "; ".join(_small_print(subject, seen))
+    figures, small = _figures(subject), "; ".join(_small_print(subject, seen))
     size, letters, line = (10, 105, 0.2) if is_compact else (7.5, 215, 0.16)  # points, a line, inches
     lines: list[tuple[str, float, dict[str, Any]]] = []
     lines += [(subject.title, 0.28, {"fontsize": 14, "fontweight": "bold"})] if subject.title else []
-    lines += [(figures, 0.28, {"fontsize": 11})] if figures else []
-    for k, words in enumerate(textwrap.wrap(small, letters)):
-        lines.append((words, line if k else 0.24, {"fontsize": size, "color": FAINT}))
+    lines += [(line_of, 0.26, {"fontsize": 11}) for line_of in figures]
+    for k, text in enumerate(textwrap.wrap(small, letters)):
+        lines.append((text, line if k else 0.24, {"fontsize": size, "color": FAINT}))
     height = 0.2 + sum(down for _, down, _ in lines)
 
     def fill(part: Any) -> None:
         y = 0.02
-        for words, down, look in lines:
+        for text, down, look in lines:
             y += down
-            part.text(0.025, 1 - y / height, words, **look)
+            part.text(0.025, 1 - y / height, text, **look)
 
     return height, fill
+
+
+def _figures(subject: Subject) -> list[str]:
+    """The figures that count, of a run, in lines."""
+    found = words.facts(subject.record or {}, subject.period)
+    kept = (f"{name[0].lower()}{name[1:]} {value}".replace(" ", "\N{NO-BREAK SPACE}") for name, value in found)
+    return textwrap.wrap("  ·  ".join(kept), 130)
 
 
 def _small_print(subject: Subject, seen: Seen | None) -> list[str]:
@@ -341,7 +349,7 @@ def _small_print(subject: Subject, seen: Seen | None) -> list[str]:
     if not has_values(subject.channel(0)):
         small.append("no values")
     if record.get("Iterations") == 0:
-        small.append("the flow changed nothing: what was removed is the extension to the surface alone")
+        small.append(words.NOTHING if subject.maps[0].volume is None else words.EXTENSION_ALONE)
     if subject.channels > 1:
         small.append(f"channel 1 of {subject.channels} is shown")
     if seen is None or subject.mesh is None:
@@ -354,28 +362,6 @@ def _small_print(subject: Subject, seen: Seen | None) -> list[str]:
     if len(subject.mesh.cells) > len(seen.folded.cells):
         small.append(f"drawn with {len(seen.folded.cells):,} of {len(subject.mesh.cells):,} triangles")
     return small
-
-
-def headline(subject: Subject) -> str:
-    """The figures that count, of a run: noise, what was removed, smoothness, iterations and time."""
-    record, of = subject.record or {}, unit(subject.period)
-    noise, smooth = record.get("Noise") or {}, record.get("Smoothness") or {}
-    parts = []
-    before, after = ((noise.get(name) or [None])[0] for name in ("sd", "after"))
-    if before is not None and after is not None:
-        parts.append(f"noise {before:.3g}{of} → {after:.3g}{of}")
-    rms = (record.get("Removed") or {}).get("rms")
-    if rms is not None:
-        parts.append(f"removed {rms:.3g}{of} rms")
-    if smooth.get("before_mm") is not None and smooth.get("after_mm") is not None:
-        parts.append(f"smoothness {smooth['before_mm']:.1f} → {smooth['after_mm']:.1f} mm FWHM")
-    if record.get("Iterations") is not None:
-        reason = f" (stop: {record['StopReason']})" if record.get("StopReason") else ""
-        parts.append(f"{record['Iterations']} iteration{'s' * (record['Iterations'] != 1)}{reason}")
-    seconds = [spent for what, spent in (record.get("Seconds") or {}).items() if what != "report" and spent is not None]
-    if seconds:
-        parts.append(f"denoised in {sum(seconds):.1f} s")
-    return "   ·   ".join(parts)
 
 
 def _many(subject: Subject, scale: Scale, seen: Seen | None) -> list[Block]:

@@ -18,22 +18,39 @@ from beltrami_cli.surface import Mesh
 LETTERS = 0.35  # inches of a slice along an axis below which the ends of that axis are not named
 NARROW = 0.3  # of the widest column, the narrowest
 RIM = 0.1  # share of the slices at either end of a volume that say little: left out where any other cuts the data
+AROUND = 4  # slices beyond a surface without a volume: room for the width of its outline
+STRAIGHT = 0.999  # cosine above which an axis counts as one of the world's
 SLICES = ("sagittal", "coronal", "axial")
 
 
 @dataclass(frozen=True, eq=False)
 class Cuts:
-    """Where a subject is cut. index: of the slice for each axis. box: (2, 3) first and last voxel that are shown."""
+    """Where a subject is cut. index: of the slice for each axis. box: (2, 3) first and last voxel that are shown.
+
+    rows_down: the first axis of a slice runs down and the second to the right, as in pictures, not right and up.
+    """
 
     grid: Grid
     index: dict[int, int]
     box: np.ndarray
+    rows_down: bool = False
+
+    def across_and_up(self, axis: int) -> tuple[int, int]:
+        """The grid's axes that a slice shows from left to right, and from bottom to top or, of a picture, down."""
+        first, second = (k for k in range(3) if k != axis)
+        return (second, first) if self.rows_down else (first, second)
 
     def size(self, axis: int) -> tuple[float, float]:
         """Width and height in mm of what is shown of a slice."""
         size = (self.box[1] - self.box[0] + 1) * self.grid.spacing
-        first, second = np.delete(size, axis)
-        return float(first), float(second)
+        across, up = self.across_and_up(axis)
+        return float(size[across]), float(size[up])
+
+    def title(self, axis: int) -> str:
+        """Which slice it is, and where in mm; of an axis that lies obliquely, about where."""
+        at = self.grid.to_world(np.where(np.arange(3) == axis, self.index[axis], self.box.mean(0))[None])[0, axis]
+        along = self.grid.affine[:3, axis] / self.grid.spacing[axis]
+        return f"{SLICES[axis]}, {'xyz'[axis]} {'=' if abs(along[axis]) > STRAIGHT else '≈'} {at:.0f} mm"
 
     def widths(self) -> list[float]:
         """Of the columns, in mm: a narrow slice still has its title above it."""
@@ -75,11 +92,11 @@ def draw(figure: Any, subject: Subject, scale: Scale | None = None) -> None:
                 title, (0, 0.5), (-16, 0), "axes fraction", "offset points", rotation=90, va="center", ha="right"
             )
     if not cuts.is_plane:
-        for (axis, index), axes in zip(cuts.index.items(), all_axes[0], strict=True):
-            at = cuts.grid.to_world(np.where(np.arange(3) == axis, index, cuts.box.mean(0))[None])[0, axis]
-            axes.set_title(f"{SLICES[axis]}, {'xyz'[axis]} = {at:.0f} mm", pad=pad, fontsize=size)
-    for axes, (axis, _) in zip(all_axes[0], [cut for _, cut in places], strict=False):
-        _letters(axes, axis)
+        for axis, axes in zip(cuts.index, all_axes[0], strict=True):
+            axes.set_title(cuts.title(axis), pad=pad, fontsize=size)
+    if subject.has_anatomy:
+        for axes, (axis, _) in zip(all_axes[0], [cut for _, cut in places], strict=False):
+            _letters(axes, cuts, axis)
     if subject.compares:
         last, inch = all_axes[-1, -1].get_position(original=True), figure.dpi / figure.bbox.width
         place = (last.x1 + 0.28 * inch, last.y0 + 0.1 * last.height, 0.12 * inch, 0.8 * last.height)
@@ -103,7 +120,7 @@ def cuts_of(subject: Subject) -> Cuts:
     volume = subject.maps[-1].volume
     shape = np.array(grid.shape)
     if (shape == 1).any():
-        return Cuts(grid, {int(np.argmin(shape)): 0}, box)
+        return Cuts(grid, {int(np.argmin(shape)): 0}, box, subject.rows_down)
     if volume is not None:
         known = np.isfinite(volume)
         if known.any():
@@ -126,22 +143,23 @@ def _slice(
     less: Map | None,
     scale: Scale,
 ) -> None:
-    """One slice of a map, or of the difference to another, its first axis to the right and its second up."""
+    """One slice of a map, or of the difference to another."""
     from matplotlib.collections import LineCollection
 
     mesh, volume, values = subject.mesh, shown.volume, shown.values
-    spacing = np.delete(cuts.grid.spacing, axis)
-    low, high = (np.delete(end, axis) for end in cuts.box)
+    both = np.array(cuts.across_and_up(axis))
+    spacing, (low, high) = cuts.grid.spacing[both], cuts.box[:, both]
     (left, bottom), (right, top) = (low - 0.5) * spacing, (high + 0.5) * spacing
     if volume is not None:
         cut = volume.take(index, axis)
         if less is not None and less.volume is not None:
             cut = subject.between(cut, less.volume.take(index, axis))
-        cut = cut[low[0] : high[0] + 1, low[1] : high[1] + 1].T
+        cut = (cut.T if cuts.rows_down else cut)[low[0] : high[0] + 1, low[1] : high[1] + 1].T
         colours = scale.rgba(cut.reshape(-1)).reshape(*cut.shape, 4)
         axes.imshow(colours, origin="lower", extent=(left, right, bottom, top), interpolation="nearest")
     if mesh is not None:
         segments, cells = geometry.outline(mesh, cuts.grid, axis, index)
+        segments = segments[..., ::-1] if cuts.rows_down else segments
         if volume is None and values is not None:
             at = mesh.cells[cells, 0]
             between = (
@@ -156,13 +174,14 @@ def _slice(
             )
         else:
             cased(axes, segments, 0.5)
-    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
+    upwards = (top, bottom) if cuts.rows_down else (bottom, top)
+    axes.set(xlim=(left, right), ylim=upwards, aspect="equal", xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
 
 
-def _letters(axes: Any, axis: int) -> None:
+def _letters(axes: Any, cuts: Cuts, axis: int) -> None:
     """Where L, R, P, A, I, S are beside a slice."""
-    first, second = (DIRECTIONS[k] for k in range(3) if k != axis)
+    first, second = (_ends(cuts.grid, shown) for shown in cuts.across_and_up(axis))
     size = np.ptp([axes.get_xlim(), axes.get_ylim()], axis=1)  # mm
     cell, figure = axes.get_position(original=True), axes.figure
     inches = np.array([cell.width * figure.bbox.width, cell.height * figure.bbox.height]) / figure.dpi
@@ -173,6 +192,14 @@ def _letters(axes: Any, axis: int) -> None:
         align = {"ha": "right" if x < 0 else "left" if x > 1 else "center"}
         align["va"] = "top" if y < 0 else "bottom" if y > 1 else "center"
         axes.text(x, y, letter, transform=axes.transAxes, color=FAINT, fontsize="small", **align)
+
+
+def _ends(grid: Grid, axis: int) -> tuple[str, str]:
+    """The letters at the two ends of a grid's axis: those of the axis of RAS that it is nearest to."""
+    along = grid.affine[:3, axis]
+    nearest = int(np.argmax(np.abs(along)))
+    low, high = DIRECTIONS[nearest]
+    return (low, high) if along[nearest] > 0 else (high, low)
 
 
 def _where_to_cut(subject: Subject, grid: Grid) -> dict[int, int]:
@@ -204,6 +231,6 @@ def _grid_around(mesh: Mesh | None) -> Grid:
     low, size = used.min(0), np.ptp(used, axis=0)
     spacing = max(float(size.max()) / 200, 1e-9)
     affine = np.diag([spacing] * 3 + [1.0])
-    affine[:3, 3] = low - spacing
-    a, b, c = (int(n) for n in np.ceil(size / spacing) + 3)
+    affine[:3, 3] = low - AROUND * spacing
+    a, b, c = (int(n) for n in np.ceil(size / spacing) + 1 + 2 * AROUND)
     return Grid((a, b, c), affine)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -32,6 +33,7 @@ STYLE = {
     "xtick.labelcolor": INK,
     "ytick.labelcolor": INK,
     "svg.fonttype": "none",
+    "text.parse_math": False,  # names of files may hold $
 }
 
 # Of a figure that is 8 inches wide: a web page shows it at 736 pixels, 61 % of its 150 dots per inch.
@@ -103,7 +105,8 @@ def legend_above(axes: Any, handles: Sequence[Any], title: str = "") -> None:
     size = points("legend.fontsize")
     box, figure = axes.get_position(), axes.figure
     across, up = box.width * figure.bbox.width / figure.dpi, figure.bbox.height / figure.dpi
-    names = [fitted(str(handle.get_label()), across - HANDLE, size) for handle in handles]
+    # matplotlib leaves out what begins with _.
+    names = [fitted(re.sub("^_", " _", str(handle.get_label())), across - HANDLE, size) for handle in handles]
     widths = [_width(name, size) + HANDLE for name in names]
     columns = len(names)
     while columns > 1 and sum(max(widths[k::columns]) for k in range(columns)) > across:
