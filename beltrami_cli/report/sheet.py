@@ -340,7 +340,7 @@ def _figures(subject: Subject) -> list[str]:
     """The figures that count, of a run, in lines."""
     found = words.facts(subject.record or {}, subject.period)
     kept = (f"{name[0].lower()}{name[1:]} {value}".replace(" ", "\N{NO-BREAK SPACE}") for name, value in found)
-    return textwrap.wrap("  ·  ".join(kept), 130)
+    return [line.strip(" ·") for line in textwrap.wrap("  ·  ".join(kept), 130)]
 
 
 def _small_print(subject: Subject, seen: Seen | None) -> list[str]:
