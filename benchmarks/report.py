@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter
 
 REPEATS = 3
 # Voxels of 1 mm along each axis, by how many vertices come of it.
-SIZES = {"60,000 vertices": 96, "125,000 vertices": 136}
+SIZES = {"60,000 vertices": 124, "125,000 vertices": 178}
 
 
 def main() -> None:
