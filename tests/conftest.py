@@ -6,6 +6,9 @@ import pytest
 from command import ball, nifti, noisy
 from hypothesis import settings
 
+from beltrami_cli import report
+from beltrami_cli.report.subject import Subject
+
 # The same examples in every run, and no deadline: the first example of a kernel pays for its compilation.
 settings.register_profile("deterministic", derandomize=True, deadline=None)
 settings.load_profile("deterministic")
@@ -29,3 +32,16 @@ def scene(tmp_path: Path) -> tuple[Path, Path, Path]:
         nifti(tmp_path / "data.nii.gz", noisy()),
         tmp_path / "out.nii.gz",
     )
+
+
+@pytest.fixture
+def shown(monkeypatch) -> list[Subject]:
+    """The subjects of the pictures, which are not drawn."""
+    subjects: list[Subject] = []
+
+    def keep(path: Path, subject: Subject) -> None:
+        subjects.append(subject)
+        path.write_text("drawn")
+
+    monkeypatch.setattr(report, "write", keep)
+    return subjects

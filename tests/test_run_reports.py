@@ -18,19 +18,6 @@ LIBRARIES = {"matplotlib", "plotly", "colorcet", "jinja2", "fast_simplification"
 FEW = ("--beta", "0.1", "--iterations", "3")
 
 
-@pytest.fixture
-def shown(monkeypatch) -> list[Subject]:
-    """The subjects of the pictures, which are not drawn."""
-    subjects: list[Subject] = []
-
-    def keep(path: Path, subject: Subject) -> None:
-        subjects.append(subject)
-        path.write_text("drawn")
-
-    monkeypatch.setattr(report, "write", keep)
-    return subjects
-
-
 def only(subjects: list[Subject]) -> Subject:
     (subject,) = subjects
     return subject

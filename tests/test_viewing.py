@@ -8,21 +8,7 @@ import numpy as np
 import pytest
 from command import ball, beltrami, contents, done, load, nifti, noisy, npy, refused
 
-from beltrami_cli import report
 from beltrami_cli.report.subject import Subject
-
-
-@pytest.fixture
-def shown(monkeypatch) -> list[Subject]:
-    """The subjects of the pictures, which are not drawn."""
-    subjects: list[Subject] = []
-
-    def keep(path: Path, subject: Subject) -> None:
-        subjects.append(subject)
-        path.write_text("drawn")
-
-    monkeypatch.setattr(report, "write", keep)
-    return subjects
 
 
 @pytest.fixture
