@@ -218,7 +218,7 @@ def test_slices_show_values_where_they_are(tmp_path):
     volume = np.full(grid.shape, np.nan)
     volume[5, 10:, :] = 1.0
     figure = Figure(figsize=(9, 4))
-    subject = Subject("s", (Map("map", None, volume),), None, grid)
+    subject = Subject("s", (Map("a", None, volume),), None, grid)
     slices.draw(figure, subject, Scale(0, 1))
     sagittal, coronal, axial = figure.axes
     assert [axes.get_title() for axes in figure.axes] == [
