@@ -13,6 +13,13 @@ from beltrami_cli.report.subject import Subject
 settings.register_profile("deterministic", derandomize=True, deadline=None)
 settings.load_profile("deterministic")
 
+
+@pytest.fixture(autouse=True)
+def one_thread(monkeypatch) -> None:
+    """Runs in this process take one thread each, unless told otherwise: other tests are on the other cores."""
+    monkeypatch.setattr("beltrami_cli.solver.cpus", lambda: 1)
+
+
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 

@@ -31,7 +31,7 @@ from beltrami_cli.record import write_record
 from beltrami_cli.study import Planned, read_study
 from beltrami_cli.surface import Mesh
 
-KILLS = 20
+KILLS = 12
 
 
 def is_hidden(name: str) -> bool:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command import ball, beltrami, contents, done, load, nifti, noisy, npy, record, refused
+from command import ball, contents, done, load, nifti, noisy, npy, record, refused
 
-from beltrami_cli import report
+from beltrami_cli import pipeline, report
+from beltrami_cli.config import Job
 from beltrami_cli.report.subject import Subject
+from beltrami_cli.resume import finished
+from beltrami_cli.study import read_study
 
 LIBRARIES = {"matplotlib", "plotly", "colorcet", "jinja2", "fast_simplification"}
 FEW = ("--beta", "0.1", "--iterations", "3")
@@ -155,23 +159,30 @@ def test_axes_are_those_of_the_head(tmp_path, shown):
     assert np.allclose(subject.maps[0].volume, load(tmp_path / "d.nii.gz").transpose(2, 0, 1)[:, ::-1, ::-1])
 
 
-def test_from_a_config_and_resumed(scene):
+def test_from_a_config_and_resumed(scene, shown):
     folder = scene[2].parent
     config, picture = folder / "study.toml", folder / "pages" / "r.png"
-    text = (
-        '[input]\nlevelset = "psi.nii.gz"\ndata = "data.nii.gz"\n'
-        '[output]\nvolume = "o/out.nii.gz"\n%s\n[flow]\nbeta = 0.1\n'
-    )
-    config.write_text(text % "")
-    done("batch", config, "-q")
-    assert "1 skipped" in beltrami("batch", config, "--resume").out
-    config.write_text(text % 'report = "pages/r.png"')
-    assert "1 done" in beltrami("batch", config, "--resume").out  # a picture is asked for that is not there
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert record(folder / "o" / "out.json")["Request"]["report"] == "../pages/r.png"
-    assert "1 skipped" in beltrami("batch", config, "--resume").out
+    picture.parent.mkdir()
+
+    def job(more: str) -> Job:
+        config.write_text(
+            '[input]\nlevelset = "psi.nii.gz"\ndata = "data.nii.gz"\n'
+            f'[output]\nvolume = "out.nii.gz"\n{more}\n[flow]\nbeta = 0.1\n[time]\niterations = 2\n'
+        )
+        (planned,) = read_study([config])
+        return planned.job
+
+    plain = job("")
+    pipeline.run(plain)
+    assert finished(plain)
+    pictured = job('report = "pages/r.png"')
+    assert finished(pictured) is None  # a picture is asked for that is not there
+    pipeline.run(replace(pictured, overwrite=True))
+    assert picture.read_text() == "drawn"
+    assert record(folder / "out.json")["Request"]["report"] == "pages/r.png"
+    assert finished(pictured)
     picture.unlink()
-    assert "1 done" in beltrami("batch", config, "--resume").out
+    assert finished(pictured) is None
 
 
 @pytest.mark.parametrize(
