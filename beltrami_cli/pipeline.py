@@ -15,7 +15,7 @@ from beltrami_cli.config import Job, Settings
 from beltrami_cli.errors import BusyError, DataError, RefusedError
 from beltrami_cli.evolve import Observer
 from beltrami_cli.extension import own_samples
-from beltrami_cli.grid import Canonical, Volume, require_same_grid, with_channels
+from beltrami_cli.grid import Canonical, Grid, Volume, require_same_grid, with_channels
 from beltrami_cli.inputs import Warnings, band_of, require_usable, without
 from beltrami_cli.kinds import kind_of
 from beltrami_cli.levelset import two_values
@@ -197,7 +197,7 @@ def _maps(job: Job, solver: Solver, given: np.ndarray, out: np.ndarray | None, m
     before, after = solver.at_mesh(given), None if mesh is None else mesh.values
     filled = None
     if before is not None and after is not None:
-        filled = np.isnan(_first(before, 1)) & ~np.isnan(_first(after, 1))
+        filled = np.isnan(_first(before)) & ~np.isnan(_first(after))
     if out is None:
         return Map("input", before), Map("denoised", after, filled=filled)
     forth = Canonical(solver.grid).forth
@@ -205,9 +205,9 @@ def _maps(job: Job, solver: Solver, given: np.ndarray, out: np.ndarray | None, m
     return Map("input", before, forth(parts(known))), Map("denoised", after, forth(parts(out)), filled)
 
 
-def _first(values: np.ndarray, axes: int) -> np.ndarray:
-    """The first channel of values whose first `axes` axes are places."""
-    return values[..., 0] if values.ndim > axes else values
+def _first(values: np.ndarray) -> np.ndarray:
+    """(V,) the first channel of values (V,) or (V, K)."""
+    return values[:, 0] if values.ndim == 2 else values
 
 
 def parts(volume: np.ndarray) -> np.ndarray:
@@ -222,20 +222,24 @@ def _subject(job: Job, scene: Scene, mesh: Mesh | None, maps: tuple[Map, ...], r
         notes.append(f"frame {frames['chosen_on'] + 1} of {frames['count']}: the one that parameters are chosen on")
     if job.settings.depth is not None:
         notes.append("input: as it is at the surface, before the average over depth")
-    return Subject(
+    subject = Subject(
         title=job.data.name,
         maps=maps,
         mesh=None if mesh is None else replace(mesh, structure=scene.structure_of(mesh)),
-        grid=None if maps[0].volume is None else Canonical(scene.grid).grid,
         period=job.settings.period,
         low=0.0 if wrapped is None else wrapped[0],
         compares=True,
         difference="removed",
         record=record,
-        has_anatomy=formats.volume_format(job.data) not in ("NPY", "PNG") if maps[0].volume is not None else True,
-        rows_down=maps[0].volume is not None and formats.volume_format(job.data) == "PNG",
         notes=tuple(notes),
     ).in_one_range()
+    return subject if maps[0].volume is None else in_space(subject, scene.grid, job.data)
+
+
+def in_space(subject: Subject, grid: Grid, data: Path) -> Subject:
+    """A subject with volumes, on this grid before its axes were brought to those of RAS, as a file has them."""
+    kind = formats.volume_format(data)
+    return replace(subject, grid=Canonical(grid).grid, has_anatomy=kind not in ("NPY", "PNG"), rows_down=kind == "PNG")
 
 
 def map_of(job: Job) -> str | int | None:

@@ -13,7 +13,7 @@ from beltrami_cli.config import Beta, Job, Settings, parse_period
 from beltrami_cli.errors import RefusedError
 from beltrami_cli.grid import Canonical, Volume, require_same_grid
 from beltrami_cli.inputs import Warnings, without
-from beltrami_cli.pipeline import map_of, parts, read_data, read_levelset, solver_on
+from beltrami_cli.pipeline import in_space, map_of, parts, read_data, read_levelset, solver_on
 from beltrami_cli.progress import Phases
 from beltrami_cli.report.colours import require_map
 from beltrami_cli.report.geometry import SIDES
@@ -162,10 +162,7 @@ def _volumes(view: View, jobs: Sequence[tuple[Job, Scene]], warnings: Warnings) 
         shown = axes.forth(parts(without(data.data, view.missing)))
         maps.append(Map(title, _at_mesh(solver, data.data), shown))
     mesh = None if first.levelset is None else solver.shown[0][0]
-    form = formats.volume_format(first.data)
-    return replace(
-        _subject(view, maps, mesh), grid=axes.grid, has_anatomy=form not in ("NPY", "PNG"), rows_down=form == "PNG"
-    )
+    return in_space(_subject(view, maps, mesh), place.grid, first.data)
 
 
 def _at_mesh(solver: Solver, data: np.ndarray) -> np.ndarray | None:

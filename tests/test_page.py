@@ -347,3 +347,14 @@ def test_a_vertex_without_a_triangle_does_not_shrink_the_surface():
     count = len(lonely.vertices_ras_mm)
     scene, _ = page._scene(Subject("s", (Map("a", np.arange(count, dtype=float)),), lonely), 1)
     assert np.allclose(scene["forms"][0]["half"], 0.5, atol=0.01)
+
+
+def test_a_hemisphere_that_is_named_is_not_taken_by_its_position():
+    mesh = angles(sphere(3)).mesh
+    assert mesh is not None
+    half = replace(mesh, vertices_ras_mm=mesh.vertices_ras_mm * 40 / np.abs(mesh.vertices_ras_mm).max() - [45.0, 0, 0])
+    values = (Map("a", np.zeros(len(half.vertices_ras_mm))),)
+    notes = [
+        page._scene(Subject("s", values, replace(half, structure=name)), 1)[1] for name in ("CortexLeft", "Cortex")
+    ]
+    assert notes == [[], ["3-D: taken for a left hemisphere, by its position."]]

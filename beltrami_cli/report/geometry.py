@@ -70,18 +70,22 @@ def is_cortex(mesh: Mesh) -> bool:
 
 def hemisphere(mesh: Mesh) -> str | None:
     """`left` or `right`: by its structure, else by its position; None where neither tells."""
-    if mesh.structure is not None:
-        for side in ("Left", "Right"):
-            if mesh.structure.endswith(side):
-                return side.lower()
-    return hemisphere_by_position(mesh)
+    return _hemisphere_by_name(mesh) or hemisphere_by_position(mesh)
+
+
+def _hemisphere_by_name(mesh: Mesh) -> str | None:
+    named = (side.lower() for side in ("Left", "Right") if (mesh.structure or "").endswith(side))
+    return next(named, None)
 
 
 def hemisphere_by_position(mesh: Mesh) -> str | None:
     """`left` or `right` of x = 0, where the vertices lie as those of one hemisphere in a scanner do; else None.
 
-    Not those of a slab, and none whose coordinates have one sign along each axis: as a rule they count from a corner.
+    Not where the structure says it, not those of a slab, and none whose coordinates have one sign along each axis: as
+    a rule they count from a corner.
     """
+    if _hemisphere_by_name(mesh):
+        return None
     low, high = _extent(mesh)
     if not _is_in_a_head(mesh) or (low * high >= 0).all():
         return None
@@ -89,7 +93,7 @@ def hemisphere_by_position(mesh: Mesh) -> str | None:
 
 
 def _has_both_hemispheres(mesh: Mesh) -> bool:
-    if mesh.structure is not None and mesh.structure.endswith(("Left", "Right")):
+    if _hemisphere_by_name(mesh):
         return False
     on_the_left = float((_used(mesh)[:, 0] < 0).mean())
     return 0.3 < on_the_left < 0.7 and _is_in_a_head(mesh)

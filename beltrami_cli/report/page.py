@@ -151,7 +151,7 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
     forms = {"inflated": geometry.inflated(mesh), "folded": mesh} if is_cortex else {"surface": mesh}
     of_channels = [subject.channel(k) for k in range(channels)]
     scales = [colours.scale_of(one) for one in of_channels]
-    first = np.isfinite(_of_channel(maps[0].values, 0))
+    first = np.isfinite(_values(of_channels[0], 0))
     best = geometry.best_view(whole, first) if subject.side is None else geometry.from_side(whole, subject.side)
     scene = {
         "triangles": _packed(mesh.cells, np.uint32),
@@ -160,10 +160,10 @@ def _scene(subject: Subject, channels: int) -> tuple[dict[str, Any], list[str]]:
         "maps": [
             {
                 "title": shown.title,
-                "values": [_packed(_of_channel(shown.values, k)[source], np.float32) for k in range(channels)],
+                "values": [_packed(_values(one, m)[source], np.float32) for one in of_channels],
                 "filled": None if shown.filled is None else _packed(shown.filled[source], np.uint8),
             }
-            for shown in maps
+            for m, shown in enumerate(maps)
         ],
         "scales": [
             {"low": scale.low, "high": scale.high, "cyclic": scale.period} if colours.has_values(one) else None
@@ -185,9 +185,11 @@ def _view(view: geometry.View) -> dict[str, Any]:
     return {"name": view.name, "camera": view.camera.tolist()}
 
 
-def _of_channel(values: np.ndarray | None, k: int) -> np.ndarray:
+def _values(subject: Subject, m: int) -> np.ndarray:
+    """(V,) of map m of a subject with one channel."""
+    values = subject.maps[m].values
     assert values is not None
-    return values[:, k] if values.ndim == 2 else values
+    return values
 
 
 def _form(name: str, mesh: Mesh, filled: np.ndarray) -> dict[str, Any]:

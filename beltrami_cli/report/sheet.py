@@ -143,7 +143,7 @@ def _seen(subject: Subject) -> Seen:
         views = [geometry.from_side(folded, subject.side), *(v for v in views if v.name != subject.side)][:4]
     sulci = geometry.curvature(folded) < 0 if is_cortex else np.zeros(len(source), bool)
     named = {view.name for view in (views if len(subject.maps) <= 2 else views[: subject.side is not None])}
-    by_position = named & {"lateral", "medial"} and folded.structure in (None, "Cortex")
+    by_position = named & {"lateral", "medial"}
     return Seen(
         folded, form, source, sulci, known, known | last, views, is_cortex,
         chosen=subject.side is not None, plain_inside=abs(outwards) > OUTWARDS and geometry.is_open(folded),
